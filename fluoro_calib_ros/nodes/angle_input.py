@@ -75,12 +75,12 @@ class AngleInput:
 
     def _faults(self, faults: FaultHandlers) -> FaultHandlers:
         """Return the fault handlers of the joint states; faults: those of the other topics."""
-        on = f'a message on {TOPIC}'
+        message = f'a message on {TOPIC}'
         return FaultHandlers(
-            lambda _: self._refuse(f'{on} cannot be decoded'),
-            lambda _, error: self._refuse(f'{on} is lost by an internal error: {error!r}'),
+            lambda _: self._refuse(f'{message} cannot be decoded'),
+            lambda _, error: self._refuse(f'{message} is lost by an internal error: {error!r}'),
             faults.reader_error,
-            lambda _, size: self._refuse(f'{on} has {size} bytes, more than are read'),
+            lambda _, size: self._refuse(f'{message} has {size} bytes, more than are read'),
         )
 
     def of_frame(self, name: str, stamp_ns: int, needed: bool) -> float | None:
@@ -104,10 +104,10 @@ class AngleInput:
         """Return the diagnostic values of a fluoroscope; empty if it has no joint."""
         if name not in self._angles.joints and not self._unknown[name]:
             return {}
-        asked = self._asked.get(name)
-        known = asked is not None and asked.angle is not None
+        lookup = self._asked.get(name)
+        known = lookup is not None and lookup.angle is not None
         return {
-            'angle [deg]': f'{math.degrees(asked.angle):.3f}' if known else '',  # type: ignore
+            'angle [deg]': f'{math.degrees(lookup.angle):.3f}' if known else '',  # type: ignore
             'frames without angle': self._unknown[name],
             'joint states received': self._received,
             'joint states late': self._angles.late(name),
@@ -126,8 +126,8 @@ class AngleInput:
 
     def _doubt(self, name: str) -> str:
         """Return why the angle of the last exposure, or of an earlier one, is unknown."""
-        asked = self._asked[name]
-        reason = self._angles.doubt(name, asked.stamp_ns) or 'some exposures had none'
+        lookup = self._asked[name]
+        reason = self._angles.doubt(name, lookup.stamp_ns) or 'some exposures had none'
         return f'the angle of the C-arm is unknown: {reason}'
 
     def _on_state(self, state: JointStates, _: Mapping[str, int]) -> None:

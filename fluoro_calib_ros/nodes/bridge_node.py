@@ -77,8 +77,8 @@ class Admission:
         if len(words) != 3 or words[0] != 'GET':
             return 'this is no request of a WebSocket'
         with suppress(ValueError):
-            given = parse_qs(urlsplit(words[1]).query).get('token', [''])[0]
-            if hmac.compare_digest(given.encode(), self.token.encode()):
+            token = parse_qs(urlsplit(words[1]).query).get('token', [''])[0]
+            if hmac.compare_digest(token.encode(), self.token.encode()):
                 return self._refusal_of_origin(headers.get('origin', ''))
         return 'the token is missing or wrong'
 
@@ -139,16 +139,16 @@ class Gate:
             writer.write(REFUSED)
             await writer.drain()
             return
-        from_inner, to_inner = await asyncio.open_connection(*self._inner)
-        to_inner.write(b'GET / HTTP/1.1' + head[head.index(b'\r\n') :])
+        inner_reader, inner_writer = await asyncio.open_connection(*self._inner)
+        inner_writer.write(b'GET / HTTP/1.1' + head[head.index(b'\r\n') :])
         try:
-            ways = (_pass_on(reader, to_inner), _pass_on(from_inner, writer))
-            tasks = [asyncio.ensure_future(way) for way in ways]
-            _, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in rest:
+            transfers = (_pass_on(reader, inner_writer), _pass_on(inner_reader, writer))
+            tasks = [asyncio.ensure_future(transfer) for transfer in transfers]
+            _, pending = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in pending:
                 task.cancel()
         finally:
-            to_inner.close()
+            inner_writer.close()
 
 
 async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -261,13 +261,13 @@ class BridgeNode(ParameterNode):
         """Offer new topics, subscribe to those with readers, and unsubscribe from the others."""
         self._discover()
         with self._lock:
-            read = {topic for topic, count in self._readers.items() if count > 0}
+            read_topics = {topic for topic, count in self._readers.items() if count > 0}
             newcomers = self._newcomers
             self._newcomers = set()
         for shown in self._shown.values():
-            if shown.topic in read and shown.subscription is None:
+            if shown.topic in read_topics and shown.subscription is None:
                 self._subscribe(shown)
-            elif shown.topic not in read and shown.subscription is not None:
+            elif shown.topic not in read_topics and shown.subscription is not None:
                 self.destroy_subscription(shown.subscription)
                 shown.subscription = None
                 shown.last = b''

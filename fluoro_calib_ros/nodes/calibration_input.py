@@ -122,20 +122,20 @@ class CalibrationInput:
             if not held:
                 continue
             self._patience[name] -= 1
-            alone = not self.conflict(name)
+            has_one_node = not self.conflict(name)
             undisputed = self._current[name] is None and len(held) == 1
-            if alone or (undisputed and self._patience[name] <= 0):
+            if has_one_node or (undisputed and self._patience[name] <= 0):
                 self._start(name, list(held.values())[-1])
                 held.clear()
 
     def _on_data(self, name: str, data: bytes) -> None:
         """Decode a message, unless it is too large."""
-        most = read_limits().max_calibration_bytes
-        if len(data) > most:
+        max_bytes = read_limits().max_calibration_bytes
+        if len(data) > max_bytes:
             self._refuse(
                 name,
                 f'the message has {len(data) / 1e6:.0f} MB, calibrations of more than '
-                f'{most / 1e6:.0f} MB are not read',
+                f'{max_bytes / 1e6:.0f} MB are not read',
             )
             return
         try:
@@ -195,8 +195,8 @@ class CalibrationInput:
             if self._next.keys() <= self._ready.keys():
                 ready, self._ready = self._ready, {}
                 self._current = {**self._current, **ready}
-                for one in ready:
-                    self._on_ready(one, ready[one])
+                for ready_name in ready:
+                    self._on_ready(ready_name, ready[ready_name])
 
     def _prepared(self, name: str, message: FluoroscopeCalibration) -> Any:
         """Return the prepared calibration, or None if it is refused."""

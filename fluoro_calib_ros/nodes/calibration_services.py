@@ -127,12 +127,14 @@ class OrientationService(RigServices):
             raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
         frames = await self._captured(names, request.frames or 1, timeout)
         calibrations = self._output.calibrations
-        present = self._output.orientation
-        oriented, _ = in_thread(
+        present_orientation = self._output.orientation
+        future, _ = in_thread(
             self._node,
-            lambda: orient(frames, phantom, calibrations, settings.rig_frame, present=present),
+            lambda: orient(
+                frames, phantom, calibrations, settings.rig_frame, present=present_orientation
+            ),
         )
-        outcome = await oriented
+        outcome = await future
         if not belongs_to(outcome.orientation, self._output.calibrations):
             raise DataError('the calibrations have changed meanwhile, capture the phantom again')
         return outcome
@@ -318,12 +320,12 @@ class SelfCalibration(Job):
             )
 
         self.running = tuple(job.frames)
-        done, self._thread = in_thread(self._node, run)
-        return done
+        future, self._thread = in_thread(self._node, run)
+        return future
 
     async def _write_report(self) -> None:
         """Write the report of the saved calibration; a failure is only logged."""
-        written, self._thread = in_thread(
+        future, self._thread = in_thread(
             self._node,
             lambda: in_worker_process(
                 'jobs.report:write_report',  # imports matplotlib
@@ -332,7 +334,7 @@ class SelfCalibration(Job):
             ),
         )
         try:
-            self._logger.info(f'report: {await written}')
+            self._logger.info(f'report: {await future}')
         except Cancelled:
             self._logger.info('the node ends: no report of the calibration is written')
         except (DataError, ValueError, OSError, RuntimeError) as error:
@@ -354,9 +356,9 @@ class SelfCalibration(Job):
             principal_distance=request.principal_distance or None,
             names=self._rig.target_names,
         )
-        others = {n: c for n, c in self._output.calibrations.items() if n not in frames}
+        unchanged = {n: c for n, c in self._output.calibrations.items() if n not in frames}
         all_frames = self._exposures.frames()
-        rig = Rig(self._rig.names, {name: all_frames[name] for name in others}, others)
+        rig = Rig(self._rig.names, {name: all_frames[name] for name in unchanged}, unchanged)
         return job, rig
 
     def _use(self, outcome: CalibrationOutcome, result: Result) -> None:
@@ -375,21 +377,21 @@ class SelfCalibration(Job):
         if fault:
             result.message = f'{result.message}; {fault}'
             self._logger.error(fault)
-        for found in outcome.result.findings:
-            begin = 'not used: ' if found.severity is Severity.NOTE else ''
-            self._logger.warning(f'{begin}{found}')
+        for finding in outcome.result.findings:
+            prefix = 'not used: ' if finding.severity is Severity.NOTE else ''
+            self._logger.warning(f'{prefix}{finding}')
         self._logger.info(result.message)
         if outcome.validation is not None:
             fill_verdict(result, outcome.validation)
             verdict = outcome.validation
             self._logger.info(f'verdict: {verdict.verdict} ({verdict.seconds:.1f} s)')
-            for found in verdict.findings:
-                self._logger.warning(found.sentence)
+            for finding in verdict.findings:
+                self._logger.warning(finding.sentence)
 
 
 def _verdict_of(validation: Validation | None) -> Verdict | None:
     """Return the verdict of a validation, None without one."""
     if validation is None:
         return None
-    findings = tuple(found.sentence for found in validation.findings)
+    findings = tuple(finding.sentence for finding in validation.findings)
     return Verdict(validation.verdict, findings, validation.calibration_id)

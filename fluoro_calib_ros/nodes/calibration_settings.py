@@ -250,17 +250,19 @@ class CalibrationFiles:
         The outcome of a costly calibration is used and published even if its folder cannot be
         written.
         """
-        present = self._output.orientation
+        current_orientation = self._output.orientation
         try:
-            kept = save_outcome(
+            saved_orientation = save_outcome(
                 self._rig.directory,
                 outcome,
-                present,
+                current_orientation,
                 lambda folder: write_radiographs(folder, radiographs),
             )
-            return kept, ''
+            return saved_orientation, ''
         except DataError as error:
-            orientation = kept_orientation(present, outcome.orientation, outcome.calibrations)
+            orientation = kept_orientation(
+                current_orientation, outcome.orientation, outcome.calibrations
+            )
             return orientation, (
                 f'the calibration is in use but not saved: {error}; save it by the service '
                 'save_calibration'
@@ -310,8 +312,8 @@ class CalibrationFiles:
         """
         names = self._rig.names
         loaded = {n: c for n, c in load_calibrations(directory).items() if n in names}
-        for found in disagreements(directory, loaded):
-            self._logger.warning(printable(str(found)))
+        for disagreement in disagreements(directory, loaded):
+            self._logger.warning(printable(str(disagreement)))
         path = Path(orientation_path(directory))
         if not loaded or not path.exists():
             return loaded, None
@@ -349,8 +351,8 @@ def check_folders(directory: Path, base: Path, limit: int) -> None:
     target = directory.resolve()
     if target.exists() or not target.is_relative_to(base.resolve()):
         return
-    new = sum(not path.exists() for path in (target, *target.parents))
+    new_count = sum(not path.exists() for path in (target, *target.parents))
     # os.walk also yields the base, so subtract one.
-    present = sum(1 for _ in itertools.islice(os.walk(base.resolve()), limit + 2)) - 1
-    if max(present, 0) + new > limit:
+    present_count = sum(1 for _ in itertools.islice(os.walk(base.resolve()), limit + 2)) - 1
+    if max(present_count, 0) + new_count > limit:
         raise DataError(f'{directory}: {base} has as many folders as max_folders allows')

@@ -82,13 +82,13 @@ def uncalibrated(state: CorrectingState) -> Health | None:
 def doubtful_angle(state: CorrectingState) -> Health | None:
     """Warn if the angle of the C-arm is unknown or far from all calibrated angles."""
     stream = state.stream
-    unknown = state.angles.health(stream.name, state.incompatible)
-    beyond, stream.beyond = stream.beyond, None
-    if unknown:
-        return unknown.with_consequence('the mean correction over all angles is used')
-    if beyond is None:
+    health = state.angles.health(stream.name, state.incompatible)
+    angle_beyond, stream.beyond = stream.beyond, None
+    if health:
+        return health.with_consequence('the mean correction over all angles is used')
+    if angle_beyond is None:
         return None
-    angle, field = beyond
+    angle, field = angle_beyond
     return warning(f'{beyond_text(angle, field.angles)}: {state.beyond}')
 
 
@@ -207,8 +207,8 @@ class CorrectingNode(StreamNode):
             for name in self.names:
                 self._on_refused_calibration(name, one_line(error))
             return
-        for found in disagreements(directory, loaded):
-            self.get_logger().warning(printable(str(found)))
+        for disagreement in disagreements(directory, loaded):
+            self.get_logger().warning(printable(str(disagreement)))
         for name in self.names:
             self._calibrations.begin_with(name, loaded[name])
 

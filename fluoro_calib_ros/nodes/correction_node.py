@@ -136,12 +136,12 @@ class CorrectionNode(CorrectingNode):
         if calibration is None:
             return
         stamp = self.streams[name].stamp
-        now = (
+        info_stamp = (
             self.get_clock().now().to_msg()
             if stamp is None
             else Time(sec=stamp[0], nanosec=stamp[1])
         )
-        self._info[name].publish(message_of_corrected_stream(calibration, now))
+        self._info[name].publish(message_of_corrected_stream(calibration, info_stamp))
 
     def _on_frame(self, name: str, frame: ObservedFrame, info: Mapping[str, int]) -> None:
         """Correct a frame and publish it."""

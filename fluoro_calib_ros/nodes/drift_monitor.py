@@ -81,11 +81,13 @@ class DriftMonitor:
 
     def use(self, parameters: DriftParameters) -> bool:
         """Use new parameters; return whether the watches must be created anew."""
-        old = self._parameters
+        previous = self._parameters
         self._parameters = parameters
         self._bodies = parameters.rigid_bodies()
-        asked = {name: getattr(parameters, name) for name in ('collect_on_drift', 'heal_on_drift')}
-        return replace(old, **asked) != parameters
+        actions = {
+            name: getattr(parameters, name) for name in ('collect_on_drift', 'heal_on_drift')
+        }
+        return replace(previous, **actions) != parameters
 
     def use_options(self, options: DriftOptions) -> None:
         """Use new options for watches created from now on."""

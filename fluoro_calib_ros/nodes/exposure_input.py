@@ -167,11 +167,11 @@ class ExposureInput:
         Returns a Future of the pair's frame number and the resulting number of exposures; its
         result is None if the wait was given up.
         """
-        captured = Future()
+        future = Future()
         with self._lock:
             self.capture_refusal = ''
-            self._captures.append(captured)
-        return captured
+            self._captures.append(future)
+        return future
 
     def give_up(self, captured: Future) -> None:
         """Stop waiting for a capture."""
@@ -337,14 +337,14 @@ class CollectServices(RigServices):
         except ValueError as error:  # including DataError
             response.message = str(error)
             return response
-        captured = self._exposures.capture()
+        future = self._exposures.capture()
         with self._requests.one():
-            found = await within(
-                self._node, timeout, captured, lambda: self._exposures.give_up(captured)
+            capture = await within(
+                self._node, timeout, future, lambda: self._exposures.give_up(future)
             )
-        response.success = found is not None
-        if found is not None:
-            number, response.exposures = found
+        response.success = capture is not None
+        if capture is not None:
+            number, response.exposures = capture
             response.message = f'frame {number} captured, {response.exposures} exposures now'
         else:
             names = self._rig.names

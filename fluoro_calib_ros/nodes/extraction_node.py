@@ -163,11 +163,14 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Fol
     try:
         if mode == 'phantom':
             return _of_phantom(expand_path(path), settings.node, logger)
-        first = _first_markers(expand_path(path), settings.node.fluoroscopes) if path else {}
+        first_markers = (
+            _first_markers(expand_path(path), settings.node.fluoroscopes) if path else {}
+        )
         if settings.node.calibration_directory:
-            return [_joined(settings, first)]
+            return [_joined(settings, first_markers)]
         return [
-            MarkerSettings({name: markers}, settings.following) for name, markers in first.items()
+            MarkerSettings({name: markers}, settings.following)
+            for name, markers in first_markers.items()
         ]
     except DataError as error:
         raise StartError(str(error)) from None
@@ -190,8 +193,8 @@ def _first_markers(path: Path, names: Sequence[str]) -> dict[str, FirstMarkers]:
     recording = read_source(path, image_size=size, fluoroscopes=names)
     out = {}
     for name, frames in recording.frames.items():
-        first = min(frames, key=lambda frame: frame.number)
-        out[name] = FirstMarkers(first.target_id, first.uv)
+        first_frame = min(frames, key=lambda frame: frame.number)
+        out[name] = FirstMarkers(first_frame.target_id, first_frame.uv)
     return out
 
 
@@ -209,10 +212,12 @@ def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> 
     bodies = settings.node.rigid_bodies()
     if settings.node.bodies:
         bodies = read_bodies(expand_path(settings.node.bodies))
-    joined = MarkerSettings(first, settings.following, calibrations, orientation, bodies=bodies)
+    marker_settings = MarkerSettings(
+        first, settings.following, calibrations, orientation, bodies=bodies
+    )
     check_orientation(orientation, calibrations)
-    joined()  # refuses inconsistent settings before the node starts
-    return joined
+    marker_settings()  # refuses inconsistent settings before the node starts
+    return marker_settings
 
 
 __all__ = ['PARAMETERS', 'ExtractionNode', 'main']
@@ -355,13 +360,13 @@ class ExtractionNode(StreamNode):
         """Publish which ids of earlier images are retracted."""
         headers = stream.headers
         remember(headers, task.number, task.message.header, REVISED)
-        for one in found.retracted:
-            if one.frame not in headers:
+        for retraction in found.retracted:
+            if retraction.frame not in headers:
                 continue
-            message = Retraction(header=headers[one.frame], frame_number=one.frame)
-            message.target_id = uint32_field(one.target_id)
+            message = Retraction(header=headers[retraction.frame], frame_number=retraction.frame)
+            message.target_id = uint32_field(retraction.target_id)
             self._retractions[stream.name].publish(message)
-            stream.retracted += len(one.target_id)
+            stream.retracted += len(retraction.target_id)
 
     # -- diagnostics
 

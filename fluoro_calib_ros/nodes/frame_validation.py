@@ -123,13 +123,13 @@ def validate_corrected(fluoroscope: str, frame: CorrectedFrame) -> None:
         raise Refused('lengths', f'{where}: {length_error(frame.target_id, **arrays)}')
     if len(set(frame.target_id.tolist())) < count:
         raise Refused('repeated target', f'{where}: a target occurs more than once')
-    for name, wrong in (
+    for name, invalid in (
         ('sigma', frame.sigma <= 0),
         ('correction_sd', frame.correction_sd < 0),
     ):  # false for NaN
-        if wrong.any():
+        if invalid.any():
             raise Refused(
                 'sigma',
-                f'{where}: {name} of target {frame.target_id[wrong.argmax()]} is not a standard '
+                f'{where}: {name} of target {frame.target_id[invalid.argmax()]} is not a standard '
                 'deviation',
             )

@@ -108,10 +108,10 @@ class MarkerCollection:
         with self._lock:
             if self.done.done():
                 return
-            of_one = self.frames.setdefault(name, [])
-            after_s = (frame.stamp_ns - of_one[-1].stamp_ns) / 1e9 if of_one else 0.0
-            self._seen_s[name] += after_s if 0 < after_s <= PAUSE_S else 0.0
-            of_one.append(frame.rows(seen))
+            frames = self.frames.setdefault(name, [])
+            elapsed_s = (frame.stamp_ns - frames[-1].stamp_ns) / 1e9 if frames else 0.0
+            self._seen_s[name] += elapsed_s if 0 < elapsed_s <= PAUSE_S else 0.0
+            frames.append(frame.rows(seen))
 
     def finish(self) -> None:
         """End the collection once: after its time, a cancellation, or the end of the node."""
@@ -184,7 +184,7 @@ class Healing(Job):
                 Heal.Feedback(stage='diagnosing', frames=count, step=step, steps=steps)
             )
 
-        done, self._thread = in_thread(
+        future, self._thread = in_thread(
             self._node,
             lambda: in_worker_process(
                 heal_rig,
@@ -193,7 +193,7 @@ class Healing(Job):
                 raise_if_cancelled=raise_if_cancelled,
             ),
         )
-        outcome = await done
+        outcome = await future
         self._check_unchanged(rig)
         fill_healing(result, outcome, rig.orientation)
         self._logger.info(result.message)
@@ -272,8 +272,8 @@ class Healing(Job):
     def _roll_back(self, _: Reset.Request) -> str:
         """Return to the parent of the healed rig in use; return a message. Raises DataError."""
         directory = self._rig.directory
-        healed = self._output.orientation
-        folder = parent_folder(directory, healed)
+        healed_orientation = self._output.orientation
+        folder = parent_folder(directory, healed_orientation)
         calibrations, orientation = self._files.load(folder)
         if orientation is None:
             raise DataError(f'{folder}: there is no orientation that belongs to the calibrations')
@@ -286,7 +286,9 @@ class Healing(Job):
     ) -> None:
         """Publish the orientation, and those calibrations that are not in use yet."""
         self._healed = None
-        present = ids_of(self._output.calibrations)
-        others = {n: c for n, c in calibrations.items() if c.calibration_id != present.get(n)}
-        self._output.publish(others, orientation)
+        current_ids = ids_of(self._output.calibrations)
+        new_calibrations = {
+            n: c for n, c in calibrations.items() if c.calibration_id != current_ids.get(n)
+        }
+        self._output.publish(new_calibrations, orientation)
         wake(self._node)

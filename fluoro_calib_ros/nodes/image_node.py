@@ -135,9 +135,9 @@ class ImageNode(CorrectingNode):
         self._compressed = outputs(CompressedImage, f'{CORRECTED}/compressed', images_qos)
         # image_transport looks for the CameraInfo in the namespace of the image. The correction
         # node publishes there, too, with latched QoS, and subscribers request that.
-        beside = outputs(CameraInfo, 'camera_info', latched_qos)
-        below = outputs(CameraInfo, f'{CORRECTED}/camera_info', images_qos)
-        self._infos = {name: (beside[name], below[name]) for name in self.names}
+        sibling_infos = outputs(CameraInfo, 'camera_info', latched_qos)
+        nested_infos = outputs(CameraInfo, f'{CORRECTED}/camera_info', images_qos)
+        self._infos = {name: (sibling_infos[name], nested_infos[name]) for name in self.names}
         self.subscribe_calibrations()
 
     def create_readers(self) -> None:
@@ -158,10 +158,10 @@ class ImageNode(CorrectingNode):
 
     def on_calibration_ready(self, name: str, prepared: _PreparedCalibration) -> None:
         """Log that a calibration is in use."""
-        empty = int((~prepared.maps.mean.mask).sum())
+        empty_pixels = int((~prepared.maps.mean.mask).sum())
         self.get_logger().info(
             f'fluoroscope {name}: calibration {prepared.calibration.calibration_id} in use '
-            f'({empty} pixels of the corrected image are empty)'
+            f'({empty_pixels} pixels of the corrected image are empty)'
         )
 
     def extra_values(
@@ -189,11 +189,11 @@ class ImageNode(CorrectingNode):
         except Refused as error:
             stream.refusals.refuse(error)
             return
-        out, pixels = stream.converter.prepare_output(message.header, encoding, image.shape)
+        corrected, pixels = stream.converter.prepare_output(message.header, encoding, image.shape)
         stamp_ns = nanoseconds_from_stamp(message.header.stamp)
         angle = self.angle_of(name, stamp_ns, prepared.calibration.angle_field)
         prepared.maps.at(angle).correct(image, pixels)
-        self._images[name].publish(out)  # copies the image
+        self._images[name].publish(corrected)  # copies the image
         prepared.info.header = message.header
         for output in self._infos[name]:
             output.publish(prepared.info)
@@ -201,7 +201,10 @@ class ImageNode(CorrectingNode):
         if self._compressed[name].get_subscription_count():
             self._compressed[name].publish(
                 compressed_message(
-                    out, pixels, self._settings.compressed_format, self._settings.jpeg_quality
+                    corrected,
+                    pixels,
+                    self._settings.compressed_format,
+                    self._settings.jpeg_quality,
                 )
             )
             stream.compressed += 1

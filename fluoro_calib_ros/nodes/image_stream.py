@@ -143,8 +143,8 @@ class ImageState(StreamState):
 
 def shed_images(state: ImageState) -> Health | None:
     """Warn if images came faster than they were extracted."""
-    shed = f'images come faster than they are extracted: {state.stream.shed} were shed'
-    return warning(shed if state.stream.shed_now else '')
+    text = f'images come faster than they are extracted: {state.stream.shed} were shed'
+    return warning(text if state.stream.shed_now else '')
 
 
 def empty_image(state: ImageState) -> Health | None:
@@ -155,8 +155,8 @@ def empty_image(state: ImageState) -> Health | None:
 
 def unknown_angle(state: ImageState) -> Health | None:
     """Warn if the angle of the C-arm is needed but unknown."""
-    unknown = state.angles.health(state.stream.name, state.incompatible)
-    return unknown and unknown.with_consequence(
+    health = state.angles.health(state.stream.name, state.incompatible)
+    return health and health.with_consequence(
         'markers are predicted by the mean correction over all angles'
     )
 
@@ -312,11 +312,14 @@ class ExtractionWorkers:
 
     def start(self, followers: Sequence[FollowerSettings]) -> None:
         """Start the processes and threads."""
-        for make in followers:
-            process = follower_process(make)
+        for follower in followers:
+            process = follower_process(follower)
             process.start()
             thread = threading.Thread(
-                target=self._serve, args=(make.names, process), name=make.names[0], daemon=True
+                target=self._serve,
+                args=(follower.names, process),
+                name=follower.names[0],
+                daemon=True,
             )
             thread.start()
             self._processes.append(process)
@@ -324,8 +327,8 @@ class ExtractionWorkers:
 
     def put(self, name: str, task: Task) -> None:
         """Queue an image; if too many wait, the oldest exposure is shed."""
-        for loser in self._queue.put(name, task.number, task):
-            self._streams[loser].shed += 1
+        for fluoroscope in self._queue.put(name, task.number, task):
+            self._streams[fluoroscope].shed += 1
 
     def waiting(self, name: str) -> int:
         """Return the number of waiting images of a fluoroscope."""
@@ -376,5 +379,5 @@ class ExtractionWorkers:
         wanted = [name for name in images if self._wanted(name)]
         angles = {name: tasks[name].angle for name in images}
         arguments = {name: lent.lend(name, image) for name, image in images.items()}
-        for name, found in process(arguments, number, wanted, angles).items():
-            self._finish(self._streams[name], tasks[name], images[name], found)
+        for name, observations in process(arguments, number, wanted, angles).items():
+            self._finish(self._streams[name], tasks[name], images[name], observations)

@@ -66,8 +66,8 @@ class Pace:
     @property
     def position_s(self) -> float:
         """Current position [s]."""
-        then, position, rate = self._anchor
-        return position + (time.monotonic() - then) * rate
+        anchor_s, position, rate = self._anchor
+        return position + (time.monotonic() - anchor_s) * rate
 
     def pause(self) -> None:
         """Stop at the current position."""
@@ -98,13 +98,13 @@ class Pace:
                 if stop.wait(WAIT_S):
                     return True
                 continue
-            then, position, rate = self._anchor
+            anchor_s, position, rate = self._anchor
             if rate == 0:  # resumed between the two lines above
                 continue
-            left = then + (position_s - position) / rate - time.monotonic()
-            if left <= 0:
+            remaining_s = anchor_s + (position_s - position) / rate - time.monotonic()
+            if remaining_s <= 0:
                 return stop.is_set()
-            if stop.wait(min(left, WAIT_S)):
+            if stop.wait(min(remaining_s, WAIT_S)):
                 return True
 
 
@@ -200,10 +200,10 @@ class PlayerNode(ParameterNode):
             topics = topics_of(bag)
         except DataError as error:
             raise StartError(str(error)) from None
-        wanted = [topic for topic in self._settings.topics if topic]
+        wanted_topics = [topic for topic in self._settings.topics if topic]
         outputs = {}
         for topic, info in topics.items():
-            if not wanted or topic in wanted:
+            if not wanted_topics or topic in wanted_topics:
                 output = self._create_output(topic, info)
                 if output is not None:
                     outputs[topic] = output
@@ -227,17 +227,17 @@ class PlayerNode(ParameterNode):
                 f'{topic} is not played: the type {info.type or "(none)"} is not installed'
             )
             return None
-        relative = topic.removeprefix(self._settings.strip_prefix).lstrip('/')
+        relative_name = topic.removeprefix(self._settings.strip_prefix).lstrip('/')
         try:
             return self.create_publisher(
                 message_type,
-                relative,
+                relative_name,
                 recorded_latched_qos() if is_latched(info) else observations_qos(),
                 qos_overriding_options=qos_overrides(),
             )
         except NameValidationException as error:
             raise StartError(
-                f'{topic} cannot be played as {relative!r}: {one_line(error)}'
+                f'{topic} cannot be played as {relative_name!r}: {one_line(error)}'
             ) from None
 
     def _wait_for_readers(self) -> None:

@@ -299,34 +299,36 @@ class ReconstructionNode(StreamNode):
             _corrected_view(exposure[name].frame) if name in exposure else None
             for name in self._names
         ]
-        first = next(exposure[name] for name in self._names if name in exposure)
-        self._drift.newest = rig.watch, rig.orientation, first.stamp_ns
-        wide, image_sd = rig.widened()
-        found = intersect_exposure(views, wide, rig.scatter, image_sd)
+        first_view = next(exposure[name] for name in self._names if name in exposure)
+        self._drift.newest = rig.watch, rig.orientation, first_view.stamp_ns
+        intersector, image_sd = rig.widened()
+        intersected = intersect_exposure(views, intersector, rig.scatter, image_sd)
         content = PointsContent(
-            stamp_ns=first.stamp_ns,
-            frame_number=first.frame.frame_number,
+            stamp_ns=first_view.stamp_ns,
+            frame_number=first_view.frame.frame_number,
             orientation_id=rig.orientation_id,
             orientation=rig.orientation,
-            target_id=found.target_id,
-            points=found.points,
+            target_id=intersected.target_id,
+            points=intersected.points,
         )
         self._output.publish(content)
         self._retractions.note({n: view.stamp_ns for n, view in exposure.items()}, content)
         self._reconstructed += 1
-        self._points.add(found.points)
-        self._misses.add(found.points)
+        self._points.add(intersected.points)
+        self._misses.add(intersected.points)
         self._output.publish_forms(
             content, self._settings.ellipsoid_sigmas, self._settings.ellipsoid_rate
         )
         if self._follower is not None:
-            number = first.frame.frame_number
-            following = rig._replace(intersector=wide)
-            for bodies in self._follower.add(found, following, number, first.stamp_ns):
+            number = first_view.frame.frame_number
+            widened_rig = rig._replace(intersector=intersector)
+            for bodies in self._follower.add(
+                intersected, widened_rig, number, first_view.stamp_ns
+            ):
                 self._bodies_output.publish(bodies)
                 self._retractions.bodies.note(bodies)
         if rig.watch is not None:
-            watch_exposure(rig.watch, first.stamp_ns, found)
+            watch_exposure(rig.watch, first_view.stamp_ns, intersected)
 
     # -- diagnostics
 

@@ -122,22 +122,22 @@ class PointsOutput:
 
     def publish_forms(self, content: PointsContent, sigmas: float, rate_hz: float) -> None:
         """Publish the other forms that have subscribers; sigmas: half axes of the ellipsoids."""
-        wanted = [
+        subscribed = [
             name
             for name in POINT_FORMS
             if name in self._outputs and self._outputs[name].get_subscription_count()
         ]
-        if not wanted:
+        if not subscribed:
             return
         data = encode_reconstructed_points(content)
         message = deserialize_message(data, ReconstructedPoints)
         good = np.flatnonzero(content.points.status <= OUTSIDE)
-        if 'points' in wanted:
+        if 'points' in subscribed:
             self._outputs['points'].publish(point_cloud(message, good))
-        if 'mocap_markers' in wanted:
+        if 'mocap_markers' in subscribed:
             self._outputs['mocap_markers'].publish(mocap_markers(message, good))
         now = time.monotonic_ns()
-        if 'markers' in wanted and now - self._markers_published_ns >= round(1e9 / rate_hz):
+        if 'markers' in subscribed and now - self._markers_published_ns >= round(1e9 / rate_hz):
             self._markers_published_ns = now
             self._outputs['markers'].publish(ellipsoid_markers(message, good, sigmas))
 
@@ -157,9 +157,9 @@ class BodiesOutput:
         self._rig_frame = rig_frame
         self._bodies = output(BodyPoses, 'reconstruction/body_poses')
         self._transforms = output(TFMessage, '/tf')
-        places = [f'reconstruction/bodies/{name}' for name in names]
-        self._poses = [output(PoseWithCovarianceStamped, f'{place}/pose') for place in places]
-        self._odometry = [output(Odometry, f'{place}/odometry') for place in places]
+        prefixes = [f'reconstruction/bodies/{name}' for name in names]
+        self._poses = [output(PoseWithCovarianceStamped, f'{prefix}/pose') for prefix in prefixes]
+        self._odometry = [output(Odometry, f'{prefix}/odometry') for prefix in prefixes]
         self._forms = [
             (output(kind, f'reconstruction/{name}'), make) for name, (kind, make) in FORMS.items()
         ]
@@ -179,9 +179,9 @@ class BodiesOutput:
                 self._poses[row].publish(pose_with_covariance(message, row))
             if self._odometry[row].get_subscription_count():
                 self._odometry[row].publish(odometry(content, message, row))
-        for form, make in self._forms:
-            if form.get_subscription_count():
-                form.publish(make(content, message))
+        for publisher, make in self._forms:
+            if publisher.get_subscription_count():
+                publisher.publish(make(content, message))
         if self._joint_states is not None and self._joint_states.get_subscription_count():
             self._joint_states.publish(joint_state(content))
 
@@ -219,19 +219,21 @@ def no_orientation(state: ReconstructionState) -> Health | None:
 
 def stalled_streams(state: ReconstructionState) -> Health | None:
     """Warn if streams have stopped, and append other faults of the streams."""
-    found = {name: stream.stalled() for name, stream in state.streams.items()}
-    stalled = [f'{name}: {message}' for name, message in found.items() if message]
+    messages = {name: stream.stalled() for name, stream in state.streams.items()}
+    stalled = [f'{name}: {message}' for name, message in messages.items() if message]
     if not stalled:
         return None
     level, message = health_of(state, STREAM_CONDITIONS)
-    more = [] if level == OK else [message]
-    return Health(max(level, WARN), '; '.join([*stalled, *more]))
+    other_faults = [] if level == OK else [message]
+    return Health(max(level, WARN), '; '.join([*stalled, *other_faults]))
 
 
 def missing_publishers(state: ReconstructionState) -> Health | None:
     """Warn if nobody publishes the frames of a fluoroscope."""
     published = map(state.node.has_publisher, state.topics)
-    missing = ', '.join(name for name, there in zip(state.streams, published) if not there)
+    missing = ', '.join(
+        name for name, is_published in zip(state.streams, published) if not is_published
+    )
     return warning(missing and f'no publisher of corrected observations of {missing}')
 
 
@@ -374,12 +376,16 @@ def statuses_of(follower: BodyFollower, counts: RecentCounts) -> list[Status]:
     bodies = [BodyState(body, state, row, *untimed) for row, body in enumerate(follower.bodies)]
     return [
         *(
-            Status(f'body {one.body.name}', *health_of(one, BODY_CONDITIONS), _values(one))
-            for one in bodies
+            Status(
+                f'body {body_state.body.name}',
+                *health_of(body_state, BODY_CONDITIONS),
+                _values(body_state),
+            )
+            for body_state in bodies
         ),
         *(
-            Status(f'joint {one.joint.name}', *health_of(one, JOINT_CONDITIONS))
-            for one in follower.joints
+            Status(f'joint {joint.joint.name}', *health_of(joint, JOINT_CONDITIONS))
+            for joint in follower.joints
         ),
     ]
 

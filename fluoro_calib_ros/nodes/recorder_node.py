@@ -240,16 +240,16 @@ def qos_document(profile: QoSProfile) -> dict[str, Any]:
 
 
 def _duration(duration: Duration) -> dict[str, int]:
-    seconds, rest = divmod(duration.nanoseconds, 10**9)
-    return {'sec': seconds, 'nsec': rest}
+    seconds, nanoseconds = divmod(duration.nanoseconds, 10**9)
+    return {'sec': seconds, 'nsec': nanoseconds}
 
 
 def type_hash_text(publisher: TopicEndpointInfo) -> str:
     """Return the type hash of a publisher, '' if the middleware does not provide it."""
-    found = publisher.topic_type_hash
-    if found is None or found.version != 1 or not any(found.value):
+    type_hash = publisher.topic_type_hash
+    if type_hash is None or type_hash.version != 1 or not any(type_hash.value):
         return ''
-    return f'RIHS01_{bytes(found.value).hex()}'
+    return f'RIHS01_{bytes(type_hash.value).hex()}'
 
 
 main = partial(run, RecorderNode)

@@ -56,9 +56,9 @@ class BodyRetractions:
         """Store a published exposure."""
         with self._lock:
             remember(self._published, content.stamp_ns, _Published(content))
-            wrong = self._early.pop(content.stamp_ns, None)
-            if wrong:
-                self._take_back(self._published[content.stamp_ns], wrong)
+            retracted_ids = self._early.pop(content.stamp_ns, None)
+            if retracted_ids:
+                self._take_back(self._published[content.stamp_ns], retracted_ids)
 
     def take_back(self, stamp_ns: int, target_id: Collection[int]) -> None:
         """Retract the poses of an exposure, possibly a future one, that use some markers."""
@@ -67,16 +67,16 @@ class BodyRetractions:
             if published is not None:
                 self._take_back(published, target_id)
             else:
-                wrong = self._early.get(stamp_ns, set()) | set(target_id)
-                remember(self._early, stamp_ns, wrong)
+                retracted_ids = self._early.get(stamp_ns, set()) | set(target_id)
+                remember(self._early, stamp_ns, retracted_ids)
 
     def _take_back(self, published: _Published, target_id: Collection[int]) -> None:
         content = published.content
-        wrong = np.array(list(target_id))
+        retracted_ids = np.array(list(target_id))
         rows = [
             row
             for row, (poses, used) in enumerate(zip(content.poses, content.used))
-            if poses.body not in published.taken and np.isin(used, wrong).any()
+            if poses.body not in published.taken and np.isin(used, retracted_ids).any()
         ]
         if not rows:
             return
@@ -89,9 +89,9 @@ class BodyRetractions:
                 poses=[_unknown_pose(content.poses[row]) for row in rows],
                 used=[content.used[row][:0] for row in rows],
                 joints=[
-                    unknown_motion(one)
-                    for one in content.joints
-                    if not bodies.isdisjoint((one.joint.proximal, one.joint.distal))
+                    unknown_motion(motion)
+                    for motion in content.joints
+                    if not bodies.isdisjoint((motion.joint.proximal, motion.joint.distal))
                 ],
             )
         )
@@ -150,15 +150,15 @@ class PointRetractions:
                 remember(self._early, key, message)
 
     def _publish(self, content: PointsContent, message: Retraction) -> None:
-        wrong = np.intersect1d(content.target_id, message.target_id)
-        if not len(wrong):
+        retracted_ids = np.intersect1d(content.target_id, message.target_id)
+        if not len(retracted_ids):
             return
-        out = Retraction(frame_number=content.frame_number, target_id=uint32_field(wrong))
+        out = Retraction(frame_number=content.frame_number, target_id=uint32_field(retracted_ids))
         out.header.stamp = stamp_from_nanoseconds(content.stamp_ns)
         out.header.frame_id = content.orientation.frame_id
         self._output.publish(out)
-        self._count += len(wrong)
-        self.bodies.take_back(content.stamp_ns, wrong.tolist())
+        self._count += len(retracted_ids)
+        self.bodies.take_back(content.stamp_ns, retracted_ids.tolist())
 
     def values(self) -> dict[str, int]:
         """Return the counts for the diagnostics."""

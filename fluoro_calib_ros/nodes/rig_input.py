@@ -86,16 +86,16 @@ class RigInput:
     @property
     def calibrated(self) -> rig_orientation.RigOrientation | None:
         """Orientation from which the newest one was healed, None if the newest is not healed."""
-        rig, known = self.newest, self._calibrated
-        if rig is None or known is None or rig.orientation.source != 'healing':
+        rig, orientation = self.newest, self._calibrated
+        if rig is None or orientation is None or rig.orientation.source != 'healing':
             return None
-        return known if known.frame_id == rig.orientation.frame_id else None
+        return orientation if orientation.frame_id == rig.orientation.frame_id else None
 
     @property
     def correction(self) -> str:
         """How far the newest orientation differs from the one before healing, as text."""
-        rig, known = self.newest, self.calibrated
-        return '' if rig is None or known is None else jump_text(known, rig.orientation)
+        rig, calibrated = self.newest, self.calibrated
+        return '' if rig is None or calibrated is None else jump_text(calibrated, rig.orientation)
 
     @property
     def newest(self) -> Rig | None:
@@ -117,7 +117,10 @@ class RigInput:
         if len(calibration_ids) == len(ids):
             return rigs.get(ids)
         for known_ids, rig in reversed(rigs.items()):
-            if all(own in (None, known) for own, known in zip(ids, known_ids)):
+            if all(
+                calibration_id in (None, known_id)
+                for calibration_id, known_id in zip(ids, known_ids)
+            ):
                 return rig
         return None
 
@@ -163,8 +166,8 @@ class RigInput:
         try:
             path = file
             if not path and folder:
-                known = orientation_path(expand_path(folder))
-                path = known if Path(known).exists() else ''
+                saved_path = orientation_path(expand_path(folder))
+                path = saved_path if Path(saved_path).exists() else ''
             if not path:
                 return None
             orientation = load_orientation(path)
@@ -301,13 +304,13 @@ class BodyFollower:
         self._rig = rig
         self.untimed += stamp_ns == self._last_ns
         self._last_ns = stamp_ns
-        found = self._tracker.add(exposure, number, stamp_ns)
-        return out if found is None else [*out, self._content(found)]
+        tracked = self._tracker.add(exposure, number, stamp_ns)
+        return out if tracked is None else [*out, self._content(tracked)]
 
     def _is_same(self, rig: Rig) -> bool:
         """Return whether the tracker matches a rig."""
-        known = self._rig
-        return known is not None and (known.orientation_id, known.intersector.reject) == (
+        current = self._rig
+        return current is not None and (current.orientation_id, current.intersector.reject) == (
             rig.orientation_id,
             rig.intersector.reject,
         )
@@ -319,13 +322,13 @@ class BodyFollower:
         """Return the contents of exposures that wait for later ones, which will not come."""
         if self._tracker is None:
             return []
-        return [self._content(one) for one in self._tracker.flush()]
+        return [self._content(exposure) for exposure in self._tracker.flush()]
 
     def _content(self, found: TrackedExposure) -> BodiesContent:
         """Return poses and joints of an exposure, and update the state."""
         assert self._rig is not None
         poses = poses_of(self.bodies, [found])
-        by_name = {one.body: one for one in poses}
+        by_name = {pose.body: pose for pose in poses}
         self._note(found)
         twist, twist_covariance = twists_of(self.bodies, found)
         return BodiesContent(
@@ -338,8 +341,8 @@ class BodyFollower:
             twist=twist,
             twist_covariance=twist_covariance,
             joints=[
-                one.add(by_name[one.joint.proximal], by_name[one.joint.distal])
-                for one in self.joints
+                joint.add(by_name[joint.joint.proximal], by_name[joint.joint.distal])
+                for joint in self.joints
             ],
             used=[
                 body.target_id[used[: len(body.target_id)]]

@@ -128,8 +128,8 @@ class ShapeLearning(RigServices):
         if window.is_complete:
             self._window = None
             self._start(window, orientation)
-        again = f'not learned: {self._refusal}; ' if self._refusal else ''
-        return Health(WARN if again else OK, f'{again}markers seen for {window.seen_s:.1f} s')
+        refusal = f'not learned: {self._refusal}; ' if self._refusal else ''
+        return Health(WARN if refusal else OK, f'{refusal}markers seen for {window.seen_s:.1f} s')
 
     def _start(self, window: MarkerCollection, orientation: RigOrientation) -> None:
         """Estimate shapes in another process."""
@@ -168,8 +168,8 @@ class ShapeLearning(RigServices):
             self._alarmed |= isinstance(error, DataError) and error.finding.kind in DRIFTED
             return
         self._learned = learned
-        for found in learned.findings:
-            self._logger.warning(found.sentence)
+        for finding in learned.findings:
+            self._logger.warning(finding.sentence)
         self._logger.info(f'shapes of {len(learned.bodies)} bodies learned')
 
 

@@ -187,8 +187,8 @@ class SimulatorNode(ParameterNode):
                     self._publish(number)
                     continue
                 # Skip missed frames, like a camera that is too slow.
-                late = math.floor((time.monotonic() - start) * parameters.rate)
-                number = max(number, min(late, parameters.frames or late))
+                due_number = math.floor((time.monotonic() - start) * parameters.rate)
+                number = max(number, min(due_number, parameters.frames or due_number))
                 self._publish_images(number)
             wait_until_acknowledged(outputs, self._stopping)
             rclpy.try_shutdown()
@@ -280,9 +280,9 @@ class SimulatorNode(ParameterNode):
         if time_s <= stand_s:
             return start
         end = self._poses[(int(cycle) + 1) % len(self._poses)]
-        part = (time_s - stand_s) / move_s
-        turn = matrix_from_vector(part * vector_from_matrix(end[0] @ start[0].T))
-        return turn @ start[0], start[1] + part * (end[1] - start[1])
+        fraction = (time_s - stand_s) / move_s
+        turn = matrix_from_vector(fraction * vector_from_matrix(end[0] @ start[0].T))
+        return turn @ start[0], start[1] + fraction * (end[1] - start[1])
 
     def stop(self) -> None:
         """Stop publishing before the node is destroyed."""

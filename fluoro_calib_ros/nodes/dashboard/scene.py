@@ -173,8 +173,10 @@ class Scene:
     def _taken(self, topic: str, kind: type, depth: int = 1) -> list[Any]:
         """Return the new messages of a topic, at most the last `depth`."""
         now = time.monotonic()
-        for name, known in list(self._readers.items()):
-            if now - known.used_at > IDLE_S or (name == topic and known.depth != depth):
+        for name, open_reader in list(self._readers.items()):
+            if now - open_reader.used_at > IDLE_S or (
+                name == topic and open_reader.depth != depth
+            ):
                 self._node.destroy_subscription(self._readers.pop(name).subscription)
         reader = self._readers.get(topic) or self._open(topic, kind, depth)
         if reader is None:
@@ -184,10 +186,10 @@ class Scene:
         handle = reader.subscription.handle
         with handle:
             while len(out) < depth:
-                taken = handle.take_message(kind, False)
-                if taken is None:
+                received = handle.take_message(kind, False)
+                if received is None:
                     break
-                out.append(taken[0])
+                out.append(received[0])
         return out
 
     def _open(self, topic: str, kind: type, depth: int) -> _Reader | None:

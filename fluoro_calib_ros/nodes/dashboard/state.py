@@ -98,8 +98,8 @@ class SessionState:
     @property
     def acceptable(self) -> bool:
         """Whether a healed rig can be accepted."""
-        healed = self.diagnosis
-        return healed.verdict == 'pass' and healed.orientation_id not in ('', self.orientation_id)
+        result = self.diagnosis
+        return result.verdict == 'pass' and result.orientation_id not in ('', self.orientation_id)
 
 
 VERDICTS = ('fail', 'cannot tell', 'pass', '')  # the worst first
@@ -107,10 +107,12 @@ VERDICTS = ('fail', 'cannot tell', 'pass', '')  # the worst first
 
 def worst_verdict(fluoroscopes: Iterable[FluoroscopeState]) -> tuple[str, tuple[str, ...]]:
     """Return the worst verdict on the calibrations in use, and the findings on all of them."""
-    of_all = tuple(fluoroscopes)
-    known = [one.verdict for one in of_all if one.verdict in VERDICTS]
-    verdict = min(known, key=VERDICTS.index, default='')
-    return verdict, tuple(dict.fromkeys(found for one in of_all for found in one.findings))
+    states = tuple(fluoroscopes)
+    verdicts = [fluoroscope.verdict for fluoroscope in states if fluoroscope.verdict in VERDICTS]
+    verdict = min(verdicts, key=VERDICTS.index, default='')
+    return verdict, tuple(
+        dict.fromkeys(finding for fluoroscope in states for finding in fluoroscope.findings)
+    )
 
 
 class Session(Protocol):
@@ -159,22 +161,22 @@ class Light:
 
 def light(state: SessionState) -> Light:
     """Return the summary of a session: its worst problem, else what to do next."""
-    bad = [node for node in state.nodes if node.level in ('error', 'silent')]
+    faulty = [node for node in state.nodes if node.level in ('error', 'silent')]
     if not state.nodes:
         return Light('error', 'No signal', 'no node of the rig has reported yet')
     if state.acceptable and not state.job:
         return Light('warn', 'Healed', 'accept the healed rig, which is then in use')
-    if bad:
-        return Light('error', 'Problem', f'{bad[0].name}: {bad[0].message}')
+    if faulty:
+        return Light('error', 'Problem', f'{faulty[0].name}: {faulty[0].message}')
     if state.job:
         return Light('busy', 'Healing' if state.job.startswith(HEAL) else 'Calibrating', state.job)
     if state.verdict == 'fail':
         return Light('error', 'Do not use', 'the last calibration has failed its verdict')
-    open_ = [f for f in state.fluoroscopes if not f.calibration_id]
-    missing = [f for f in open_ if not f.ready]
-    if missing:
-        return Light('warn', 'Collecting', f'{missing[0].name}: {missing[0].next_pose}')
-    if open_:
+    uncalibrated = [f for f in state.fluoroscopes if not f.calibration_id]
+    collecting = [f for f in uncalibrated if not f.ready]
+    if collecting:
+        return Light('warn', 'Collecting', f'{collecting[0].name}: {collecting[0].next_pose}')
+    if uncalibrated:
         return Light('warn', 'Ready', 'enough poses are collected: calibrate')
     doubtful = [node for node in state.nodes if node.level == 'warn']
     if doubtful:

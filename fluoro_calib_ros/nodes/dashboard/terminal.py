@@ -89,9 +89,9 @@ def _frames(state: FluoroscopeState) -> str:
 
 
 def _coverage(state: FluoroscopeState) -> Text:
-    done = round(BAR * state.coverage)
-    bar = Text('#' * done, style='green')
-    bar.append('.' * (BAR - done), style='dim')
+    filled = round(BAR * state.coverage)
+    bar = Text('#' * filled, style='green')
+    bar.append('.' * (BAR - filled), style='dim')
     bar.append(f' {100 * state.coverage:3.0f} %')
     return bar
 
@@ -136,9 +136,9 @@ def _results(state: SessionState) -> Table:
     table.add_row('orientation', _cell(state.orientation or 'none yet'))
     table.add_row('drift', _coloured(state.drift_level, state.drift or '-'))
     if state.diagnosis.verdict:
-        healed = ', a accepts it' if state.acceptable else ''
+        hint = ', a accepts it' if state.acceptable else ''
         table.add_row(
-            'healing', _coloured(state.diagnosis.verdict, state.diagnosis.verdict + healed)
+            'healing', _coloured(state.diagnosis.verdict, state.diagnosis.verdict + hint)
         )
         for finding in state.diagnosis.findings:
             table.add_row('', _cell(finding))

@@ -151,22 +151,22 @@ class SessionClient(Node):
 
     def _check_answers(self) -> None:
         """Report unanswered requests: answers get lost when a node ends or has just started."""
-        before = time.monotonic() - ANSWER_S
+        earliest = time.monotonic() - ANSWER_S
         with self._lock:
-            for future, (action, since) in list(self._asked.items()):
-                if since < before:
+            for future, (action, requested_at) in list(self._asked.items()):
+                if requested_at < earliest:
                     del self._asked[future]
                     self._say(f'{action.replace("_", " ")}: {NO_ANSWER}')
-            self._actions.check(before)
+            self._actions.check(earliest)
 
     def _on_answer(self, action: str, future: Future) -> None:
         with self._lock:
             self._asked.pop(future, None)
         answer = future.result()
-        failed = '' if answer.success else ' failed'
+        suffix = '' if answer.success else ' failed'
         if answer.success and action in (ACCEPT, ROLL_BACK):
             self._set(diagnosis=Diagnosis())
-        self._say(f'{action.replace("_", " ")}{failed}: {answer.message}')
+        self._say(f'{action.replace("_", " ")}{suffix}: {answer.message}')
 
     def _on_status(self, message: CalibrationStatus) -> None:
         rmse = (message.rmse_u, message.rmse_v)
@@ -250,8 +250,8 @@ class SessionClient(Node):
     def _follow(self, name: str) -> None:
         """Subscribe to the status of a fluoroscope, once."""
         if not self._session.results and self._settings.services_are_ready():
-            found = self._settings.get_parameters(['calibration_directory'])
-            found.add_done_callback(self._on_settings)
+            future = self._settings.get_parameters(['calibration_directory'])
+            future.add_done_callback(self._on_settings)
         if name not in self._followed:
             self._followed.add(name)
             self.create_subscription(
@@ -269,8 +269,8 @@ class SessionClient(Node):
         return meter.hz
 
     def _update(self, name: str, **changes: Any) -> None:
-        known = self._fluoroscopes.get(name, FluoroscopeState(name))
-        self._fluoroscopes[name] = replace(known, **changes)
+        state = self._fluoroscopes.get(name, FluoroscopeState(name))
+        self._fluoroscopes[name] = replace(state, **changes)
 
     def _set(self, **changes: Any) -> None:
         with self._lock:
@@ -335,11 +335,11 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument('--port', type=int, default=8080)
     parser.add_argument('--mas', type=float, default=0.0)
     parser.add_argument('--dicom', type=Path)
-    options, words = parser.parse_known_args(args)
+    options, ros_arguments = parser.parse_known_args(args)
     is_terminal = sys.stdin.isatty() and sys.stdout.isatty()
     if not options.once and not options.web and not is_terminal:
         sys.exit('fluoro-calib watch: this is no terminal; with --once the state is only printed')
-    with session_client(words) as client:
+    with session_client(ros_arguments) as client:
         if options.once:
             _print(client)
         elif options.web:
@@ -347,8 +347,10 @@ def main(args: Sequence[str] | None = None) -> None:
             from .web import WebOptions, serve
 
             scene = Scene(client.get_namespace())
-            page = WebOptions(options.host, options.port, mas=options.mas, dicom=options.dicom)
-            serve(client, scene, page)
+            web_options = WebOptions(
+                options.host, options.port, mas=options.mas, dicom=options.dicom
+            )
+            serve(client, scene, web_options)
         else:
             from .terminal import Dashboard
 

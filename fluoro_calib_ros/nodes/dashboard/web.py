@@ -93,10 +93,10 @@ class Handler(RequestHandler):
 
     def prepare(self) -> None:
         """Refuse requests without the token, and requests of other pages that act on the rig."""
-        given = self.get_query_argument('token', '')
+        token = self.get_query_argument('token', '')
         cookie = f'fluoro_calib_{self._desk.options.port}'
-        if self._is_token(given):
-            self.set_cookie(cookie, given, httponly=True, samesite='Strict')
+        if self._is_token(token):
+            self.set_cookie(cookie, token, httponly=True, samesite='Strict')
             self.redirect(self.request.path)  # drops the token, which a screenshot would show
         elif not self._is_token(self.get_cookie(cookie) or ''):
             raise HTTPError(403, reason='Forbidden', log_message=REFUSAL)
@@ -182,12 +182,12 @@ class ResidualHandler(Handler):
     async def get(self) -> None:
         """Answer with the vectors, or with the reason why there are none."""
         key = ' '.join(f.calibration_id for f in self._desk.session.state().fluoroscopes)
-        known = self._desk.residuals
-        if key not in known:
-            known.clear()
+        cache = self._desk.residuals
+        if key not in cache:
+            cache.clear()
             folder = _results(self._desk)
-            known[key] = await asyncio.to_thread(_vectors_of, folder)
-        self._finish_json(known[key])
+            cache[key] = await asyncio.to_thread(_vectors_of, folder)
+        self._finish_json(cache[key])
 
 
 class ReportHandler(Handler):
@@ -255,16 +255,16 @@ async def _write_report(folder: Path) -> None:
 
 def application(desk: Desk) -> Application:
     """Return the application that serves the page."""
-    name = '([A-Za-z0-9_-]+)'
+    name_pattern = '([A-Za-z0-9_-]+)'
     routes: list[tuple[str, type[Handler]]] = [
         *((path, FileHandler) for path in FILES),
         ('/state', StateHandler),
-        (f'/fluoroscopes/{name}/radiograph', RadiographHandler),
-        (f'/fluoroscopes/{name}/coverage', CoverageHandler),
+        (f'/fluoroscopes/{name_pattern}/radiograph', RadiographHandler),
+        (f'/fluoroscopes/{name_pattern}/coverage', CoverageHandler),
         ('/space', SpaceHandler),
         ('/residuals', ResidualHandler),
         ('/report', ReportHandler),
-        (f'/request/{name}', RequestHandlerOfSession),
+        (f'/request/{name_pattern}', RequestHandlerOfSession),
     ]
     return Application([(path, handler, {'desk': desk}) for path, handler in routes])
 

@@ -74,23 +74,23 @@ class BodiesContent(NamedTuple):
     @property
     def measured(self) -> list[int]:
         """Rows of the bodies whose poses were measured in this exposure."""
-        return [row for row, one in enumerate(self.poses) if one.status[0] in MEASURED]
+        return [row for row, pose in enumerate(self.poses) if pose.status[0] in MEASURED]
 
 
 def message_from_bodies(content: BodiesContent) -> BodyPoses:
     """Return the message of the poses of all bodies."""
     poses = content.poses
     message = BodyPoses(header=content.header(), frame_number=content.frame_number)
-    message.body = [one.body for one in poses]
-    position = np.array([one.position_mm[0] for one in poses]) / 1000
-    attitude = quaternion_from_matrix(np.array([one.rotation[0] for one in poses]))
+    message.body = [pose.body for pose in poses]
+    position = np.array([pose.position_mm[0] for pose in poses]) / 1000
+    attitude = quaternion_from_matrix(np.array([pose.rotation[0] for pose in poses]))
     for name, column in zip(('x', 'y', 'z'), position.T):
         setattr(message, name, float64_field(column))
     for name, column in zip(('qw', 'qx', 'qy', 'qz'), attitude.T):
         setattr(message, name, float64_field(column))
-    message.covariance = float64_field(np.array([one.covariance[0] for one in poses]) * _SCALE)
-    message.status = uint8_field([one.status[0] for one in poses])
-    message.markers = uint32_field([one.markers[0] for one in poses])
+    message.covariance = float64_field(np.array([pose.covariance[0] for pose in poses]) * _SCALE)
+    message.status = uint8_field([pose.status[0] for pose in poses])
+    message.markers = uint32_field([pose.markers[0] for pose in poses])
     message.orientation_id = content.orientation_id
     message.calibration_id = list(content.orientation.calibration_ids)
     return message
@@ -173,19 +173,21 @@ def detections(content: BodiesContent, message: BodyPoses) -> vision.Detection3D
     out = vision.Detection3DArray(header=message.header)
     for row in content.measured:
         body = content.bodies[row]
-        one = vision.Detection3D(header=message.header, id=body.name)
+        detection = vision.Detection3D(header=message.header, id=body.name)
         result = vision.ObjectHypothesisWithPose()
         result.hypothesis.class_id = body.name
         result.hypothesis.score = 1.0
         result.pose = pose_with_covariance(message, row).pose
-        one.results = [result]
+        detection.results = [result]
         low, high = body.xyz_mm.min(axis=0), body.xyz_mm.max(axis=0)
-        one.bbox.center = pose_of(message, row)
+        detection.bbox.center = pose_of(message, row)
         poses = content.poses[row]
-        middle = poses.rotation[0] @ ((low + high) / 2) + poses.position_mm[0]
-        one.bbox.center.position = _point(middle)
-        one.bbox.size.x, one.bbox.size.y, one.bbox.size.z = ((high - low) / 1000).tolist()
-        out.detections.append(one)
+        centre = poses.rotation[0] @ ((low + high) / 2) + poses.position_mm[0]
+        detection.bbox.center.position = _point(centre)
+        detection.bbox.size.x, detection.bbox.size.y, detection.bbox.size.z = (
+            (high - low) / 1000
+        ).tolist()
+        out.detections.append(detection)
     return out
 
 
@@ -194,10 +196,10 @@ def rigid_bodies(content: BodiesContent, message: BodyPoses) -> mocap.RigidBodie
     out = mocap.RigidBodies(header=message.header, frame_number=message.frame_number)
     for row in content.measured:
         body, poses = content.bodies[row], content.poses[row]
-        places = body.xyz_mm @ poses.rotation[0].T + poses.position_mm[0]
+        positions = body.xyz_mm @ poses.rotation[0].T + poses.position_mm[0]
         markers = [
             mocap.Marker(id_type=mocap.Marker.USE_INDEX, marker_index=k, translation=_point(xyz))
-            for k, xyz in zip(body.target_id.tolist(), places)
+            for k, xyz in zip(body.target_id.tolist(), positions)
         ]
         pose = pose_of(message, row)
         out.rigidbodies.append(
@@ -218,14 +220,18 @@ def message_from_joints(content: BodiesContent) -> JointAngles:
     """Return the message of the motion of all joints."""
     joints = content.joints
     message = JointAngles(header=content.header(), frame_number=content.frame_number)
-    message.joint = [one.joint.name for one in joints]
-    message.convention = [one.joint.convention for one in joints]
-    message.angle_name = [name for one in joints for name in one.angle_names]
-    message.translation_name = [name for one in joints for name in one.translation_names]
-    message.angle = float64_field([one.angles[0] for one in joints])
-    message.translation = float64_field(np.array([one.translations[0] for one in joints]) / 1000)
-    message.covariance = float64_field(np.array([one.covariance[0] for one in joints]) * _OF_JOINT)
-    message.status = uint8_field([one.status[0] for one in joints])
+    message.joint = [motion.joint.name for motion in joints]
+    message.convention = [motion.joint.convention for motion in joints]
+    message.angle_name = [name for motion in joints for name in motion.angle_names]
+    message.translation_name = [name for motion in joints for name in motion.translation_names]
+    message.angle = float64_field([motion.angles[0] for motion in joints])
+    message.translation = float64_field(
+        np.array([motion.translations[0] for motion in joints]) / 1000
+    )
+    message.covariance = float64_field(
+        np.array([motion.covariance[0] for motion in joints]) * _OF_JOINT
+    )
+    message.status = uint8_field([motion.status[0] for motion in joints])
     message.orientation_id = content.orientation_id
     message.calibration_id = list(content.orientation.calibration_ids)
     return message
@@ -234,8 +240,8 @@ def message_from_joints(content: BodiesContent) -> JointAngles:
 def joint_state(content: BodiesContent) -> JointState:
     """Return the angles of measured joints, named <joint>_<angle>."""
     out = JointState(header=content.header())
-    for one in content.joints:
-        if one.status[0] in (JointStatus.OK, JointStatus.WEAK):
-            out.name.extend(f'{one.joint.name}_{name}' for name in one.angle_names)
-            out.position.extend(one.angles[0].tolist())
+    for motion in content.joints:
+        if motion.status[0] in (JointStatus.OK, JointStatus.WEAK):
+            out.name.extend(f'{motion.joint.name}_{name}' for name in motion.angle_names)
+            out.position.extend(motion.angles[0].tolist())
     return out

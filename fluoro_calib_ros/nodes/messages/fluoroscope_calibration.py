@@ -181,10 +181,10 @@ def image_size_of(
             f'topic {topic}: the image size is {message.width} x {message.height} px, '
             'so this is not the camera_info of a correction node'
         )
-    found = message.header.frame_id
-    if frame_id and found and found != frame_id:
+    received = message.header.frame_id
+    if frame_id and received and received != frame_id:
         raise DataError(
-            f'topic {topic}: the camera_info is of frame {found}, not of {frame_id}: it is of '
+            f'topic {topic}: the camera_info is of frame {received}, not of {frame_id}: it is of '
             'another camera'
         )
     k = message.k[[2, 5, 0]]  # row by row: c, 0, xp, 0, c, yp, 0, 0, 1

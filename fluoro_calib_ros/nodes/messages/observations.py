@@ -121,10 +121,10 @@ def columns_bytes(
     parts: list[Any] = [start, count, target_id]
     # The first float64 is aligned after its count; the counts of the other columns are therefore
     # followed by four bytes of padding.
-    before = count + b'\0' * (-(len(start) + 4 + len(target_id)) % 8)
+    prefix = count + b'\0' * (-(len(start) + 4 + len(target_id)) % 8)
     for column in columns:
-        parts += before, column
-        before = count + b'\0\0\0\0'
+        parts += prefix, column
+        prefix = count + b'\0\0\0\0'
     padding = b'\0' * (-number % 4)
     for octet in octets:
         parts += count, octet, padding
@@ -180,9 +180,9 @@ def decode_target_observations(data: bytes) -> ObservedFrame:
     """Read a TargetObservations message from its bytes. Raises ValueError for damaged bytes."""
     data = as_little_endian(data, TargetObservations)
     try:
-        sec, nanosec, frame_id, at = read_header(data)
-        number, width, height, count = _IMAGE.unpack_from(data, at)
-        end = at + 16 + 4 * count
+        sec, nanosec, frame_id, image_start = read_header(data)
+        number, width, height, count = _IMAGE.unpack_from(data, image_start)
+        end = image_start + 16 + 4 * count
         u, offset = read_float64_sequence(data, end)
         v, offset = read_float64_sequence(data, offset)
         sigma, _ = read_float64_sequence(data, offset)
@@ -194,11 +194,11 @@ def decode_target_observations(data: bytes) -> ObservedFrame:
         frame_id=frame_id,
         frame_number=number,
         image_size=(width, height),
-        target_id=data[at + 16 : end],
+        target_id=data[image_start + 16 : end],
         u=u,
         v=v,
         sigma=sigma,
-        start=data[: at + 4],
+        start=data[: image_start + 4],
     )
 
 
@@ -275,21 +275,21 @@ def decode_corrected_observations(data: bytes) -> CorrectedFrame:
     """Read a CorrectedObservations message from its bytes. Raises ValueError if damaged."""
     data = as_little_endian(data, CorrectedObservations)
     try:
-        sec, nanosec, frame_id, at = read_header(data)
-        number, length = TWO_UINT32.unpack_from(data, at)
-        calibration_id, at = read_string(data, at + 8, length)
-        (count,) = UINT32.unpack_from(data, at)
-        at += 4
-        target_id = np.frombuffer(data[at : at + 4 * count], np.uint32)
-        at += 4 * count
-        u, at = read_float64_sequence(data, at)
-        v, at = read_float64_sequence(data, at)
-        sigma, at = read_float64_sequence(data, at)
-        correction_sd, at = read_float64_sequence(data, at)
-        (count,) = UINT32.unpack_from(data, at)
+        sec, nanosec, frame_id, offset = read_header(data)
+        number, length = TWO_UINT32.unpack_from(data, offset)
+        calibration_id, offset = read_string(data, offset + 8, length)
+        (count,) = UINT32.unpack_from(data, offset)
+        offset += 4
+        target_id = np.frombuffer(data[offset : offset + 4 * count], np.uint32)
+        offset += 4 * count
+        u, offset = read_float64_sequence(data, offset)
+        v, offset = read_float64_sequence(data, offset)
+        sigma, offset = read_float64_sequence(data, offset)
+        correction_sd, offset = read_float64_sequence(data, offset)
+        (count,) = UINT32.unpack_from(data, offset)
     except error as reason:  # beyond the end of the bytes
         raise ValueError(str(reason)) from None
-    if at + 4 + count > len(data):
+    if offset + 4 + count > len(data):
         raise ValueError(TRUNCATED)
     return CorrectedFrame(
         sec=sec,
@@ -302,7 +302,7 @@ def decode_corrected_observations(data: bytes) -> CorrectedFrame:
         v=v,
         sigma=sigma,
         correction_sd=correction_sd,
-        status=np.frombuffer(data, np.uint8, count, at + 4),
+        status=np.frombuffer(data, np.uint8, count, offset + 4),
     )
 
 

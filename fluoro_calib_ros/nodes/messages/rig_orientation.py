@@ -45,9 +45,9 @@ def transforms_of_orientation(
     if calibrated is not None:
         return _with_corrections(message, rig_frame, calibrated)
     out = TFMessage()
-    given = message.header.frame_id
-    if given != rig_frame and given not in message.optical_frame_id:
-        out.transforms.append(_transform(message, rig_frame, given))
+    message_frame = message.header.frame_id
+    if message_frame != rig_frame and message_frame not in message.optical_frame_id:
+        out.transforms.append(_transform(message, rig_frame, message_frame))
     for i, child in enumerate(message.optical_frame_id):
         if child == rig_frame:
             continue
@@ -67,7 +67,7 @@ def _with_corrections(
     out = transforms_of_orientation(message, rig_frame)
     before = message_from_orientation(calibrated)
     earlier = {
-        one.child_frame_id: one for one in transforms_of_orientation(before, rig_frame).transforms
+        tf.child_frame_id: tf for tf in transforms_of_orientation(before, rig_frame).transforms
     }
     moved = rig_change(calibrated, content_of_orientation(message))
     for healed in list(out.transforms):
@@ -77,7 +77,7 @@ def _with_corrections(
         old = earlier[child]
         old.child_frame_id = healed.header.frame_id = f'{child}{AS_CALIBRATED}'
         out.transforms.append(old)
-        (p0, r0), (p1, r1) = (_pose_of(one) for one in (old, healed))
+        (p0, r0), (p1, r1) = (_pose_of(tf) for tf in (old, healed))
         _set_pose(healed, r0.T @ (p1 - p0), r0.T @ r1)
     return out
 
@@ -161,9 +161,9 @@ def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
 def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
     """Return the orientation of a message without comparing its id. Raises DataError."""
     count = len(message.fluoroscope)
-    most = read_limits().max_fluoroscopes
-    if count > most:
-        raise DataError(f'rig orientation: {count} fluoroscopes, more than {most} are not read')
+    limit = read_limits().max_fluoroscopes
+    if count > limit:
+        raise DataError(f'rig orientation: {count} fluoroscopes, more than {limit} are not read')
     if not count:
         raise DataError('rig orientation: it has no fluoroscopes')
     columns = {
@@ -223,9 +223,11 @@ def _moved_by(before: rig.RigOrientation, after: rig.RigOrientation, name: str) 
     """Return how far a fluoroscope has moved between orientations, '' if it has not."""
     if name not in before.fluoroscopes:
         return ''
-    old, f = before.index(name), after.index(name)
-    shift = np.linalg.norm(after.position_mm[f] - before.position_mm[old])
-    turn = np.linalg.norm(vector_from_matrix(after.rotation[f] @ before.rotation[old].T))
+    f_before, f_after = before.index(name), after.index(name)
+    shift = np.linalg.norm(after.position_mm[f_after] - before.position_mm[f_before])
+    turn = np.linalg.norm(
+        vector_from_matrix(after.rotation[f_after] @ before.rotation[f_before].T)
+    )
     if shift < 1e-6 and turn < 1e-7:  # rounding by the conversion to a message and back
         return ''
     return f'{shift:.2f} mm and {np.degrees(turn):.3f} degrees'

@@ -116,18 +116,18 @@ def fill_healing(result: Heal.Result, outcome: HealingOutcome, parent: RigOrient
     result.verdict = outcome.verdict
     result.parent_orientation_id = parent.orientation_id
     result.findings = sentences(outcome.findings)
-    result.probability = [float(one) for one in outcome.diagnosis.probability]
+    result.probability = [float(probability) for probability in outcome.diagnosis.probability]
     result.checks = [check.sentence for check in outcome.checks if not check.passed]
     result.exposures = outcome.exposures
     result.place_sd_mm = float(outcome.after.place_mm)
     result.scale_sd = float(outcome.after.scale)
     _fill_changes(result, outcome)
-    what = list(result.findings)
+    statements = list(result.findings)
     if outcome.changed_meanwhile:
-        what.insert(0, CHANGED_MEANWHILE)
+        statements.insert(0, CHANGED_MEANWHILE)
     result.message = '; '.join(
         [
-            *(what or ['no change is evident']),
+            *(statements or ['no change is evident']),
             outcome.common_motion.sentence,
             outcome.unseen_distortion.sentence,
             f'verdict: {outcome.verdict}',

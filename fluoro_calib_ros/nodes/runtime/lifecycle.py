@@ -214,14 +214,14 @@ class StreamNode(ManagedNode):
 
     def incompatible_publishers(self) -> dict[str, str]:
         """Return a message for every topic with an incompatible publisher, and log them."""
-        found: dict[str, str] = {}
+        messages: dict[str, str] = {}
         for reader in self.readers:
             for topic in reader.accept_best_effort():
                 self.get_logger().warning(best_effort_message(topic))
-            found.update(reader.incompatible_publishers())
-        for message in found.values():
+            messages.update(reader.incompatible_publishers())
+        for message in messages.values():
             self.limited_logger.warning(message)
-        return found
+        return messages
 
     def configure(self) -> None:
         """Create outputs, slow inputs and the diagnostics."""
@@ -245,16 +245,16 @@ class StreamNode(ManagedNode):
 
     def _log_readiness(self) -> None:
         """Log that the node is ready and which publishers it waits for, whenever that changes."""
-        found: dict[str, bool] = {}
+        topics: dict[str, bool] = {}
         for reader in self.readers:
             for topic, published in reader.topics().items():
                 # Of raw and compressed images, one suffices.
                 topic = topic.removesuffix('/compressed')
-                found[topic] = found.get(topic, False) or published
-        if not found:
+                topics[topic] = topics.get(topic, False) or published
+        if not topics:
             return
-        missing = [topic for topic, published in found.items() if not published]
-        state = f'receiving {", ".join(found)}'
+        missing = [topic for topic, published in topics.items() if not published]
+        state = f'receiving {", ".join(topics)}'
         if missing:
             state = f'waiting for a publisher of {", ".join(missing)}'
         if state != self._readiness:
@@ -355,8 +355,8 @@ def lost_messages(state: InputState) -> Health | None:
 
 def incompatible_publisher(state: InputState) -> Health | None:
     """Warn if a publisher offers less than is requested."""
-    found = [state.incompatible[topic] for topic in state.topics if topic in state.incompatible]
-    return warning(found[0] if found else '')
+    messages = [state.incompatible[topic] for topic in state.topics if topic in state.incompatible]
+    return warning(messages[0] if messages else '')
 
 
 def inactive_node(state: InputState) -> Health | None:
@@ -388,8 +388,8 @@ def several_nodes(state: StreamState) -> Health | None:
 
 def missing_publisher(state: StreamState) -> Health | None:
     """Warn if nobody publishes the stream."""
-    found = any(map(state.node.has_publisher, state.topics))
-    return warning('' if found else f'no publisher of {state.subject}')
+    has_publisher = any(map(state.node.has_publisher, state.topics))
+    return warning('' if has_publisher else f'no publisher of {state.subject}')
 
 
 def stalled_stream(state: StreamState) -> Health | None:

@@ -138,9 +138,9 @@ def _spin(executor: SingleThreadedExecutor, node: Node, ended: threading.Event) 
 
 def _init(args: Sequence[str] | None) -> None:
     """Initialise ROS. Raises StartError for invalid arguments."""
-    words = sys.argv if args is None else args
+    arguments = sys.argv if args is None else args
     try:
-        for option, path in pairwise(words):
+        for option, path in pairwise(arguments):
             if option == '--params-file':
                 check_regular_file(path)  # rcl would block on a pipe and ignore interrupts
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
@@ -159,10 +159,10 @@ def _make(make_node: Callable[[], Node]) -> Node:
     except BaseException as error:
         # A partly constructed node has joined the graph, too; find it in its constructor's frame.
         for frame, _ in traceback.walk_tb(error.__traceback__):
-            half = frame.f_locals.get('self')
-            if isinstance(half, Node):
+            partial_node = frame.f_locals.get('self')
+            if isinstance(partial_node, Node):
                 with suppress(Exception):  # parts that it does not have yet
-                    half.destroy_node()
+                    partial_node.destroy_node()
                 break
         if isinstance(error, USER_ERRORS):
             raise StartError(one_line(error)) from None
@@ -242,9 +242,9 @@ def _description(declaration: Option) -> str:
     if declaration.minimum is not None and declaration.maximum is not None:
         text += f'; {declaration.minimum:g} to {declaration.maximum:g}'
     if isinstance(default, bool):
-        shown = str(default).lower()
+        default_text = str(default).lower()
     elif isinstance(default, tuple):
-        shown = f'[{", ".join(map(str, default))}]'
+        default_text = f'[{", ".join(map(str, default))}]'
     else:
-        shown = str(default) if default != '' else "''"
-    return f'{text} (default: {shown})'
+        default_text = str(default) if default != '' else "''"
+    return f'{text} (default: {default_text})'

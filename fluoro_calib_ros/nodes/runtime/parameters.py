@@ -190,9 +190,9 @@ class ParameterGroup(Generic[T]):
             )
 
         def check(parameters: Sequence[Parameter]) -> SetParametersResult:
-            own = [p for p in parameters if p.name in declarations]
+            group_parameters = [p for p in parameters if p.name in declarations]
             try:
-                options_with(own)
+                options_with(group_parameters)
             except ValueError as error:
                 return SetParametersResult(successful=False, reason=f'parameter {error}')
             return SetParametersResult(successful=True)
@@ -253,12 +253,14 @@ def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -
     Integers are accepted for floating-point parameters.
     """
     default = declaration.default
-    given = node._parameter_overrides.get(declaration.name)  # rclpy has no public access to them
-    if given is not None:
-        if isinstance(default, float) and given.type_ == Parameter.Type.INTEGER:
-            given = Parameter(declaration.name, value=float(given.value))
-            node._parameter_overrides[declaration.name] = given
-        _check_given(declaration, given)
+    override = node._parameter_overrides.get(
+        declaration.name
+    )  # rclpy has no public access to them
+    if override is not None:
+        if isinstance(default, float) and override.type_ == Parameter.Type.INTEGER:
+            override = Parameter(declaration.name, value=float(override.value))
+            node._parameter_overrides[declaration.name] = override
+        _check_given(declaration, override)
     try:
         value = node.declare_parameter(
             declaration.name,
@@ -348,15 +350,15 @@ def unknown_parameters(node: Node) -> list[str]:
     nodes of a rig are not reported, because a file may set them for all nodes (/**).
     """
     sentences = []
-    others: frozenset[str] | None = None
+    rig_parameters: frozenset[str] | None = None
     for name in node._parameter_overrides:  # rclpy has no public access to them
         if node.has_parameter(name) or name.startswith(_OF_ROS):
             continue
-        others = _parameters_of_rig() if others is None else others
-        if name in others:
+        rig_parameters = _parameters_of_rig() if rig_parameters is None else rig_parameters
+        if name in rig_parameters:
             continue
-        close = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
-        hint = f'; did you mean {close[0]}?' if close else '; --help lists the parameters'
+        matches = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
+        hint = f'; did you mean {matches[0]}?' if matches else '; --help lists the parameters'
         sentences.append(f'there is no parameter {name}, it has no effect{hint}')
     return sentences
 

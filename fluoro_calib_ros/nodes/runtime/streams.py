@@ -236,7 +236,7 @@ class StreamReader:
 
         Keys are the topics as passed to subscribe(), without namespace and remapping.
         """
-        found = {}
+        messages = {}
         for topic, subscription, *_ in self._routes:
             for publisher in self._node.get_publishers_info_by_topic(subscription.topic_name):
                 result, reason = qos_check_compatible(
@@ -244,8 +244,8 @@ class StreamReader:
                 )
                 if result == QoSCompatibility.ERROR:
                     reason = reason.removeprefix('ERROR: ').strip(' ;.').lower()
-                    found[topic] = incompatible_qos_message(topic, reason)
-        return found
+                    messages[topic] = incompatible_qos_message(topic, reason)
+        return messages
 
     def start(self) -> None:
         """Start receiving; to be called from the thread that created the subscriptions."""

@@ -247,9 +247,9 @@ def _frames_in(
     """Read the exposures of a bag or file, or extract the beads of images. Raises DataError."""
     if not contains_images(source):
         return read_source(source, collect='auto').frames
-    told = None if progress is None else partial(progress, 'image')
+    report_image = None if progress is None else partial(progress, 'image')
     return recording_of_images(
-        source, survey, principal_distance_px=principal_distance, progress=told
+        source, survey, principal_distance_px=principal_distance, progress=report_image
     ).frames
 
 

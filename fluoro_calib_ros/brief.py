@@ -17,8 +17,8 @@ MAX_TEXT = 60  # maximum number of shown characters of a text
 
 def brief_repr(result: Any) -> str:
     """Return the representation of a dataclass: scalars in full, larger values by their size."""
-    shown = (f'{field.name}={_brief(getattr(result, field.name))}' for field in fields(result))
-    return f'<{type(result).__name__} {", ".join(shown)}>'
+    parts = (f'{field.name}={_brief(getattr(result, field.name))}' for field in fields(result))
+    return f'<{type(result).__name__} {", ".join(parts)}>'
 
 
 def _brief(value: object) -> str:
@@ -33,7 +33,7 @@ def _brief(value: object) -> str:
         names = ', '.join(map(str, list(value)[:MAX_ITEMS]))
         return f'{{{names}{", ..." if len(value) > MAX_ITEMS else ""}}}'
     if isinstance(value, Sequence):
-        if len(value) > MAX_ITEMS or any(hasattr(each, '__dict__') for each in value):
+        if len(value) > MAX_ITEMS or any(hasattr(item, '__dict__') for item in value):
             return f'[{len(value)} {type(value[0]).__name__}]'
         return f'[{", ".join(map(_brief, value))}]'
     return type(value).__name__

@@ -68,10 +68,10 @@ class DataError(ValueError):
         self, *found: object, at: object = '', kind: Kind = Kind.DATA, **more: Any
     ) -> None:
         findings = (
-            one if isinstance(one, Finding) else Finding(kind, _shown(str(one)), **more)
-            for one in found or ('',)
+            item if isinstance(item, Finding) else Finding(kind, _shown(str(item)), **more)
+            for item in found or ('',)
         )
-        self.findings = tuple(one.at(at) for one in findings)
+        self.findings = tuple(finding.at(at) for finding in findings)
         super().__init__(_shown('. '.join(sentences(self.findings))))
 
     @property

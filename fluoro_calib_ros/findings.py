@@ -245,7 +245,11 @@ class Finding:
 
 def sentences(findings: Iterable[Finding], severity: Severity | None = None) -> list[str]:
     """Return the sentences of findings, of one severity or of all."""
-    return [one.sentence for one in findings if severity is None or one.severity is severity]
+    return [
+        finding.sentence
+        for finding in findings
+        if severity is None or finding.severity is severity
+    ]
 
 
 def sentence_of(*parts: object) -> str:
@@ -256,13 +260,13 @@ def sentence_of(*parts: object) -> str:
 def first_few(names: Iterable[object], separator: str = ', ') -> str:
     """Return the first few names as text, and how many more there are."""
     texts = list(map(str, names))
-    first = separator.join(texts[:MAX_LISTED])
-    further = len(texts) - MAX_LISTED
-    return f'{first} and {further} more' if further > 0 else first
+    text = separator.join(texts[:MAX_LISTED])
+    remaining = len(texts) - MAX_LISTED
+    return f'{text} and {remaining} more' if remaining > 0 else text
 
 
 def _named(noun: str, things: tuple[object, ...]) -> str:
     """Return things with their noun, '' if there are none."""
     *others, last = map(str, things) if things else ('',)
-    both = f'{", ".join(others)} and {last}' if others else last
-    return f'{noun}{"s" * bool(others)} {both}' if things else ''
+    listed = f'{", ".join(others)} and {last}' if others else last
+    return f'{noun}{"s" * bool(others)} {listed}' if things else ''

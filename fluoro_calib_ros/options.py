@@ -118,6 +118,6 @@ def validate_options(options: object, except_for: Collection[str] = ()) -> None:
 
     except_for: names of options that are validated elsewhere.
     """
-    for name, one in declared(options).items():
+    for name, declaration in declared(options).items():
         if name not in except_for:
-            one.validate(getattr(options, name))
+            declaration.validate(getattr(options, name))

@@ -92,13 +92,19 @@ class WorkerProcess:
             if self._process is not None or self._closed:
                 return
             context = multiprocessing.get_context('spawn')  # a fork would copy locks of threads
-            self._connection, other = context.Pipe()
+            self._connection, child_connection = context.Pipe()
             # Arguments are unpickled in order: the watch before those that import modules.
-            arguments = (_ParentWatch(), read_limits(), self._resources, other, self._make)
+            arguments = (
+                _ParentWatch(),
+                read_limits(),
+                self._resources,
+                child_connection,
+                self._make,
+            )
             self._process = context.Process(target=_serve, daemon=True, args=arguments)
             with interrupts_blocked():
                 self._process.start()
-            other.close()
+            child_connection.close()
 
     def __call__(
         self,
@@ -226,8 +232,8 @@ def _given(function: Callable[..., Any] | str) -> Callable[..., Any]:
     if not isinstance(function, str):
         return function
     module, _, name = function.partition(':')
-    found: Callable[..., Any] = getattr(import_module(f'.{module}', __package__), name)
-    return found
+    imported: Callable[..., Any] = getattr(import_module(f'.{module}', __package__), name)
+    return imported
 
 
 class LentArrays:

@@ -103,8 +103,13 @@ def _frames(
         if row is not None:
             calibration = film.calibrations[name].at_angle(image.angle)
             views = [
-                _view(body, one.rows(one.number == image.exposure), film.orientation, calibration)
-                for body, one in zip(bodies, poses)
+                _view(
+                    body,
+                    body_poses.rows(body_poses.number == image.exposure),
+                    film.orientation,
+                    calibration,
+                )
+                for body, body_poses in zip(bodies, poses)
             ]
             yield image.place, draw_bodies(image.image, f'exposure {image.exposure}', views)
 
@@ -234,7 +239,9 @@ class BodiesOutcome:
         for poses in self.poses:
             if poses.body == name:
                 return body_figure(poses)
-        names = [motion.joint.name for motion in self.joints] + [one.body for one in self.poses]
+        names = [motion.joint.name for motion in self.joints] + [
+            body_poses.body for body_poses in self.poses
+        ]
         raise DataError(f'no joint or body is named {name!r}, but {", ".join(names)}')
 
     def summary(self) -> dict[str, Any]:
@@ -305,31 +312,31 @@ def track_bodies(
     shapes = [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
     if options.estimate_shapes:
         shapes = estimated_shapes(bodies, recording)
-    usable = solvable_bodies([shape.body for shape in shapes])
+    solvable = solvable_bodies([shape.body for shape in shapes])
     lag = options.lag if options.smooth == 'lag' else None
-    tracker = BodyTracker(orientation, usable, options.reject, lag)
+    tracker = BodyTracker(orientation, solvable, options.reject, lag)
     tracked = []
-    for count, one in enumerate(exposures, 1):
-        tracker.use(one.orientation)
-        found = tracker.add(one.views, one.number, one.stamp_ns)
-        if found is not None:
-            tracked.append(found)
+    for count, exposure in enumerate(exposures, 1):
+        tracker.use(exposure.orientation)
+        tracked_exposure = tracker.add(exposure.views, exposure.number, exposure.stamp_ns)
+        if tracked_exposure is not None:
+            tracked.append(tracked_exposure)
         step(len(exposures) + count, 2 * len(exposures))
     tracked = tracker.smoothed() if lag is None else tracked + tracker.flush()
-    poses = _poses(usable, tracked, options)
-    at_rest = []
+    poses = _poses(solvable, tracked, options)
+    rest_poses = []
     if options.neutral is not None:
-        at_rest = _poses_alone(options.neutral, calibrations, orientation, usable, options)
-        joints = [replace(one, neutral=(0, sys.maxsize)) for one in joints]
+        rest_poses = _poses_alone(options.neutral, calibrations, orientation, solvable, options)
+        joints = [replace(entry, neutral=(0, sys.maxsize)) for entry in joints]
     findings = [finding for shape in shapes for finding in shape.findings]
-    named = {one.place for one in findings if one.kind is Kind.BODY_UNSEEN}
-    unseen = [_unseen(one) for one in poses if not one.known.any()]
-    findings += [one for one in unseen if one.place not in named]
+    unseen_places = {finding.place for finding in findings if finding.kind is Kind.BODY_UNSEEN}
+    unseen = [_unseen(body_poses) for body_poses in poses if not body_poses.known.any()]
+    findings += [finding for finding in unseen if finding.place not in unseen_places]
     return BodiesOutcome(
         tuple(shapes),
         tracked,
         poses=poses,
-        joints=_joints(joints, poses, at_rest or poses),
+        joints=_joints(joints, poses, rest_poses or poses),
         unpaired=recording.unpaired,
         findings=tuple(findings),
         noise=recording.noise,
@@ -376,15 +383,19 @@ def intersected(
     watch = RecordingDriftWatch(orientation, sizes)
     out = []
     for count, exposure in enumerate(paired, 1):
-        wide, _ = watch.widened(intersector)
-        views, present = intersect_frames(exposure, calibrations, intersector, scatter, watch)
-        stamp = present[0].stamp_ns
+        widened, _ = watch.widened(intersector)
+        views, present_frames = intersect_frames(
+            exposure, calibrations, intersector, scatter, watch
+        )
+        stamp = present_frames[0].stamp_ns
         if options.rate is not None:
-            stamp = 1 + round(present[0].number * NS_PER_S / options.rate)
-        out.append(IntersectedExposure(present[0].number, stamp, views, wide.orientation))
+            stamp = 1 + round(present_frames[0].number * NS_PER_S / options.rate)
+        out.append(
+            IntersectedExposure(present_frames[0].number, stamp, views, widened.orientation)
+        )
         if progress is not None:
             progress(count, len(paired))
-    stamps = np.array([one.stamp_ns for one in out])
+    stamps = np.array([entry.stamp_ns for entry in out])
     if len(out) > 1 and not (np.diff(stamps) > 0).all():
         raise DataError(
             'the exposures have no times, or not in their order; give the rate of the recording'
@@ -399,9 +410,9 @@ def estimated_shapes(
     """Estimate the shapes of bodies from exposures spread evenly over the recording."""
     exposures = recording.exposures
     rows = np.unique(np.linspace(0, len(exposures) - 1, SHAPE_EXPOSURES).astype(int))
-    chosen = [exposures[row].views for row in rows]
-    ids = [one.target_id for one in chosen]
-    points = [_split(one, recording.sides) for one in chosen]
+    sampled = [exposures[row].views for row in rows]
+    ids = [views.target_id for views in sampled]
+    points = [_split(views, recording.sides) for views in sampled]
     return [estimate_shape(body, places_of(body, ids, points)) for body in bodies]
 
 
@@ -433,10 +444,10 @@ def _poses(
     """Return the poses of the frames of the bodies, smoothed according to the options."""
     if options.smooth in ('auto', 'lag'):
         return poses_of(bodies, tracked)
-    alone = poses_alone(bodies, tracked)
+    unsmoothed = poses_alone(bodies, tracked)
     if options.smooth == 'none':
-        return alone
-    return [filtered_poses(poses, options.cutoff) for poses in alone]
+        return unsmoothed
+    return [filtered_poses(poses, options.cutoff) for poses in unsmoothed]
 
 
 def _poses_alone(
@@ -449,16 +460,18 @@ def _poses_alone(
     """Return the unsmoothed poses in another recording. Raises DataError."""
     exposures = intersected(frames, calibrations, orientation, options).exposures
     tracker = BodyTracker(orientation, bodies, options.reject)
-    tracked = [tracker.add(one.views, one.number, one.stamp_ns) for one in exposures]
-    return poses_alone(bodies, [one for one in tracked if one is not None])
+    tracked = [
+        tracker.add(exposure.views, exposure.number, exposure.stamp_ns) for exposure in exposures
+    ]
+    return poses_alone(bodies, [exposure for exposure in tracked if exposure is not None])
 
 
 def _joints(
     requests: Sequence[JointEntry], poses: Sequence[BodyPoses], at_rest: Sequence[BodyPoses]
 ) -> list[JointMotion]:
     """Return the motion of joints; poses at rest give neutral positions. Raises DataError."""
-    by_name = {one.body: one for one in poses}
-    neutral = {one.body: one for one in at_rest}
+    by_name = {body_poses.body: body_poses for body_poses in poses}
+    neutral = {body_poses.body: body_poses for body_poses in at_rest}
     out = []
     for request in requests:
         joint = request.joint
@@ -466,9 +479,9 @@ def _joints(
         distal = by_name[joint.distal]
         if request.neutral is not None:
             first, last = request.neutral
-            both = neutral[joint.proximal], neutral[joint.distal]
-            rows = (both[0].number >= first) & (both[0].number <= last)
-            joint = with_neutral(joint, both[0].rows(rows), both[1].rows(rows))
+            neutral_poses = neutral[joint.proximal], neutral[joint.distal]
+            rows = (neutral_poses[0].number >= first) & (neutral_poses[0].number <= last)
+            joint = with_neutral(joint, neutral_poses[0].rows(rows), neutral_poses[1].rows(rows))
         out.append(joint_motion(joint, proximal, distal))
     return out
 

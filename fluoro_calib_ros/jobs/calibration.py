@@ -90,10 +90,10 @@ def adjust(
     require_phantom(cleaned, phantom)
     result = adjust_with_calibrations(cleaned, phantom, used, loss)
     if misfits(result, used, cleaned):
-        without = adjust_with_calibrations(cleaned, phantom, uncorrected(used), loss)
-        corrected = corrected_already(result, without, used, cleaned)
-        if corrected is not None:
-            raise DataError(corrected)
+        uncorrected_result = adjust_with_calibrations(cleaned, phantom, uncorrected(used), loss)
+        finding = corrected_already(result, uncorrected_result, used, cleaned)
+        if finding is not None:
+            raise DataError(finding)
     findings = (*strays, *result.findings, *poor_fits(result, used, cleaned))
     return replace(result, findings=findings)
 
@@ -138,9 +138,9 @@ class CalibrationOutcome:
     validation: Validation | None = None
 
     def __repr__(self) -> str:
-        own = ', '.join(self.result.calibrations)
+        names = ', '.join(self.result.calibrations)
         verdict = self.validation.verdict if self.validation else 'not validated'
-        return f'<CalibrationOutcome of {own}: {verdict}>'
+        return f'<CalibrationOutcome of {names}: {verdict}>'
 
     def _repr_html_(self) -> str:
         return f'<pre>{html.escape(self.summary())}</pre>'
@@ -159,10 +159,14 @@ class CalibrationOutcome:
         """
         from ..report.figures import distortion_figure
 
-        (one,) = select_calibrations(self.result.calibrations, [name]).values()
-        if not one.model.corrects:
-            raise DataError(f'fluoroscope {name}: the model {one.model.kind} corrects nothing')
-        return distortion_figure(one.model, name, one.image_size, one.interior_estimated)
+        (calibration,) = select_calibrations(self.result.calibrations, [name]).values()
+        if not calibration.model.corrects:
+            raise DataError(
+                f'fluoroscope {name}: the model {calibration.model.kind} corrects nothing'
+            )
+        return distortion_figure(
+            calibration.model, name, calibration.image_size, calibration.interior_estimated
+        )
 
     @property
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:
@@ -220,22 +224,24 @@ def run_calibration(
     validate_names((*request.frames, *(rig.frames if rig else ())))
     validate_magnitudes(request.frames, request.phantom)
     request, excluded = without_unusable(request)
-    wrong = _wrong_input(request)
-    if wrong and not force:
-        raise DataError(*wrong)
+    faults = _wrong_input(request)
+    if faults and not force:
+        raise DataError(*faults)
     result = _calibrated(request, progress)
     excluded += _with_causes(request, result)
-    wrong += [*implausible(request, result), *_interchanged(result)]
-    if wrong and not force:
-        raise DataError(*wrong)
+    faults += [*implausible(request, result), *_interchanged(result)]
+    if faults and not force:
+        raise DataError(*faults)
     rig = rig or Rig()
-    of_rig = _findings_of_rig(request, result, rig)
-    result = replace(result, findings=(*excluded, *of_rig.doubts, *wrong))
+    rig_outcome = _findings_of_rig(request, result, rig)
+    result = replace(result, findings=(*excluded, *rig_outcome.doubts, *faults))
     validation = None
     if validate:
-        used = request.with_exposures(result.used_exposures)
-        validation = validate_or_report(used, result.calibrations, report_step, of_rig)
-    return CalibrationOutcome(request, result, rig, of_rig.orientation, validation)
+        used_request = request.with_exposures(result.used_exposures)
+        validation = validate_or_report(
+            used_request, result.calibrations, report_step, rig_outcome
+        )
+    return CalibrationOutcome(request, result, rig, rig_outcome.orientation, validation)
 
 
 def _wrong_input(request: CalibrationRequest) -> list[Finding]:
@@ -250,13 +256,13 @@ def _wrong_input(request: CalibrationRequest) -> list[Finding]:
         )
     unknown = {name: exposures for name, exposures in frames.items() if name not in known}
     # With known orientations the points are in motion: they may rest, or come from far away.
-    found = [
+    findings = [
         *([] if known else find_wrong_phantom(frames, request.phantom)),
         *find_wrong_input(unknown, request.phantom),
     ]
-    mixed = None if known else mixed_units(unknown, request.phantom, bool(found))
+    mixed = None if known else mixed_units(unknown, request.phantom, bool(findings))
     return [
-        *([mixed] if mixed else found),
+        *([mixed] if mixed else findings),
         *find_wrong_orientation(frames, request.phantom, known),
     ]
 
@@ -286,7 +292,7 @@ def _with_causes(request: CalibrationRequest, result: CalibrationResult) -> list
             for frame in frames:
                 if frame.number not in used:
                     causes[frame.place] = why_excluded(frame, request.phantom)
-    return [found.explained_by(causes.get(found.place)) for found in result.findings]
+    return [finding.explained_by(causes.get(finding.place)) for finding in result.findings]
 
 
 def without_unusable(request: CalibrationRequest) -> tuple[CalibrationRequest, list[Finding]]:
@@ -298,7 +304,7 @@ def without_unusable(request: CalibrationRequest) -> tuple[CalibrationRequest, l
     frames, copies = _without_copies(frames, request.known_orientations)
     frames, shared = _without_shared(frames)
     joined, repeats = without_repeats(frames, request.known_orientations)
-    if any(len(of_one) < MIN_EXPOSURES for of_one in joined.values()):
+    if any(len(exposures) < MIN_EXPOSURES for exposures in joined.values()):
         joined, repeats = frames, []  # too few poses, which is reported elsewhere
     return replace(request, frames=joined), [*strays, *copies, *shared, *repeats]
 
@@ -345,9 +351,9 @@ def _without_shared(frames: Frames) -> tuple[dict[str, list[Frame]], list[Findin
     out = {name: list(exposures) for name, exposures in frames.items()}
     findings = []
     for names in combinations(frames, 2):
-        one, other = (frames[name] for name in names)
-        pairs = shared_exposures(one, other)
-        if len(pairs) > MAX_SHARED * min(len(one), len(other)):
+        first_frames, second_frames = (frames[name] for name in names)
+        pairs = shared_exposures(first_frames, second_frames)
+        if len(pairs) > MAX_SHARED * min(len(first_frames), len(second_frames)):
             raise DataError(
                 f'{len(pairs)} exposures have the same image points, as if one recording had '
                 'been given for both',
@@ -374,8 +380,8 @@ def _interchanged(result: CalibrationResult) -> list[Finding]:
     """Return a finding for each fluoroscope with frames interchanged with those of the first."""
     first, *others = result.fluoroscopes
     figures = result.fluoroscopes
-    found = [interchanged((first, name), figures[first], figures[name]) for name in others]
-    return [one for one in found if one is not None]
+    findings = [interchanged((first, name), figures[first], figures[name]) for name in others]
+    return [finding for finding in findings if finding is not None]
 
 
 def _findings_of_rig(

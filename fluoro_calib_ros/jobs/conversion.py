@@ -123,17 +123,17 @@ def convert(request: ConversionRequest) -> Written:
     Raises DataError if the source cannot be read or lacks what the format needs, or if the output
     cannot be written.
     """
-    known = request.settings
+    settings = request.settings
     calibrations: Calibrations = {}
     if request.calibration is not None:
         calibrations = load_calibrations(request.calibration)
-        size = known.image_size or next(iter(calibrations.values())).image_size
-        names = read_names(request.calibration).merged(known.names)
-        known = replace(known, image_size=size, names=names)
+        size = settings.image_size or next(iter(calibrations.values())).image_size
+        names = read_names(request.calibration).merged(settings.names)
+        settings = replace(settings, image_size=size, names=names)
     wanted = _parts_written(request.kind)
-    reading = replace(known, wanted=wanted, fluoroscopes=tuple(request.fluoroscopes))
-    content, is_own = _read(request, reading)
-    content = replace(content, names=known.names.merged(content.names))
+    read_settings = replace(settings, wanted=wanted, fluoroscopes=tuple(request.fluoroscopes))
+    content, is_own = _read(request, read_settings)
+    content = replace(content, names=settings.names.merged(content.names))
     content = _selected(content, request)
     if request.corrected:
         observations, notes = _corrected(content, calibrations, request)
@@ -162,11 +162,11 @@ def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, 
     if from_bag:
         return _bag_content(source, request.angles), True
     content = registry.read(source, settings, request.source_kind)
-    own = request.source_kind
-    if own is None and source.is_file():
-        found = registry.recognised(source)
-        own = found.kind if found else ''
-    return content, own in ('observations', 'phantom', 'points', 'poses', 'grid')
+    kind = request.source_kind
+    if kind is None and source.is_file():
+        recognised = registry.recognised(source)
+        kind = recognised.kind if recognised else ''
+    return content, kind in ('observations', 'phantom', 'points', 'poses', 'grid')
 
 
 def _bag_content(source: Path, angles: AngleOptions) -> Content:
@@ -178,9 +178,11 @@ def _bag_content(source: Path, angles: AngleOptions) -> Content:
 
 def _lost_angles(request: ConversionRequest, observations: Frames) -> tuple[str, ...]:
     """Return a note if angles of the C-arm are lost in the output."""
-    has_angle = any(frame.angle is not None for each in observations.values() for frame in each)
-    own = request.kind == 'observations'
-    if own or not has_angle or 'observations' not in _parts_written(request.kind):
+    has_angle = any(
+        frame.angle is not None for frames in observations.values() for frame in frames
+    )
+    holds_angles = request.kind == 'observations'
+    if holds_angles or not has_angle or 'observations' not in _parts_written(request.kind):
         return ()
     return (
         f'{request.out}: this format does not hold the angles of the C-arm, they are left out',
@@ -201,17 +203,17 @@ def _selected(content: Content, request: ConversionRequest) -> Content:
     wanted = list(request.fluoroscopes)
     if not wanted:
         return content
-    has = {camera.name: camera for camera in content.cameras}
-    of_name: list[Mapping[str, Any]] = [has, content.lookups, content.grids]
-    of_name.append(content.observations or {})
-    present = list(dict.fromkeys(name for table in of_name for name in table))
+    cameras_by_name = {camera.name: camera for camera in content.cameras}
+    tables: list[Mapping[str, Any]] = [cameras_by_name, content.lookups, content.grids]
+    tables.append(content.observations or {})
+    names = list(dict.fromkeys(name for table in tables for name in table))
     for name in wanted:
-        if present and name not in present:
+        if names and name not in names:
             raise DataError(
-                f'{request.source}: there is no fluoroscope {name!r}, only {", ".join(present)}'
+                f'{request.source}: there is no fluoroscope {name!r}, only {", ".join(names)}'
             )
     cameras, lookups, grids, observations = (
-        {name: table[name] for name in wanted if name in table} for table in of_name
+        {name: table[name] for name in wanted if name in table} for table in tables
     )
     return replace(
         content,
@@ -227,8 +229,10 @@ def _write(request: ConversionRequest, content: Content, is_own: bool) -> Writte
     settings = request.settings
     if request.kind == BAG:
         if not content.observations:
-            has = ' and '.join(PARTS[name] for name in content.parts) or 'nothing of that kind'
-            raise DataError(f'a bag needs image points, but the source has {has}')
+            parts_text = (
+                ' and '.join(PARTS[name] for name in content.parts) or 'nothing of that kind'
+            )
+            raise DataError(f'a bag needs image points, but the source has {parts_text}')
         write_bag(request.out, content.observations)
         return Written((str(request.out),))
     keeps_unit = not registry.FORMATS[request.kind].says_units
@@ -258,8 +262,8 @@ def _corrected(
         for frame in frames:
             angle = request.angle if frame.angle is None else frame.angle
             points = calibrations[name].correct(frame.uv, frame.sigma, angle=angle)
-            kept = points.status != CorrectionStatus.INVALID
-            out[name].append(replace(frame, uv=points.uv, sigma=points.sigma).rows(kept))
+            valid = points.status != CorrectionStatus.INVALID
+            out[name].append(replace(frame, uv=points.uv, sigma=points.sigma).rows(valid))
     return out, tuple(notes)
 
 
@@ -281,31 +285,31 @@ def result_content(
     settings = settings or FileSettings()
     wanted = set(settings.wanted)
     calibrations = load_calibrations(directory)
-    found: dict[str, Any] = {'names': read_names(directory)}
+    parts: dict[str, Any] = {'names': read_names(directory)}
     stations: tuple[Station, ...] = ()
     if {'stations', 'bodies'} & wanted or exposure is not None:
         stations = tuple(stations_of(directory / RESULT))
-        found['stations'] = stations
+        parts['stations'] = stations
     orientation = _orientation(directory, calibrations)
     if 'cameras' in wanted:
         poses = _poses(directory, stations, orientation, exposure)
-        found['cameras'] = tuple(_camera(c, poses) for c in calibrations.values())
+        parts['cameras'] = tuple(_camera(c, poses) for c in calibrations.values())
     if 'bodies' in wanted:
-        found['bodies'] = _phantom_poses(directory, stations, orientation)
+        parts['bodies'] = _phantom_poses(directory, stations, orientation)
     if 'lookups' in wanted:
         names = select_calibrations(calibrations, settings.fluoroscopes or calibrations, directory)
-        found['lookups'] = {name: _lookup(c.at_angle(angle)) for name, c in names.items()}
+        parts['lookups'] = {name: _lookup(c.at_angle(angle)) for name, c in names.items()}
         turning = [name for name, c in names.items() if c.angle_field is not None]
         if turning and angle is None:
-            found['notes'] = (
+            parts['notes'] = (
                 f'{directory}: the corrections of {", ".join(turning)} depend on the angle of the '
                 'C-arm: lookup tables are the mean over the angles, --angle-deg is not given',
             )
     if 'survey' in wanted and (directory / PHANTOM_FILE).exists():
-        found['survey'] = read_phantom(directory / PHANTOM_FILE)
+        parts['survey'] = read_phantom(directory / PHANTOM_FILE)
     if 'observations' in wanted and (directory / OBSERVATIONS).exists():
-        found['observations'] = read_calibrated_frames(directory, calibrations)
-    return Content(**found)
+        parts['observations'] = read_calibrated_frames(directory, calibrations)
+    return Content(**parts)
 
 
 def _orientation(directory: Path, calibrations: Calibrations) -> RigOrientation | None:
@@ -352,12 +356,12 @@ def _poses(
             return {}
         poses = zip(orientation.rotation, orientation.position_mm)
         return dict(zip(orientation.fluoroscopes, poses))
-    found = {
+    known_poses = {
         s.fluoroscope: (s.rotation, s.position_mm) for s in stations if s.exposure == exposure
     }
-    if not found:
+    if not known_poses:
         raise DataError(f'{directory / RESULT}: there is no exposure {exposure}')
-    return found
+    return known_poses
 
 
 def _camera(calibration: FluoroscopeCalibration, poses: Poses) -> Camera:
@@ -384,12 +388,14 @@ def _phantom_poses(
     Without an orientation of the rig, they are in the optical frame of that fluoroscope.
     """
     first = stations[0].fluoroscope if orientation is None else orientation.fluoroscopes[0]
-    own = sorted((s for s in stations if s.fluoroscope == first), key=lambda s: s.exposure)
-    if not own:
+    first_stations = sorted(
+        (s for s in stations if s.fluoroscope == first), key=lambda s: s.exposure
+    )
+    if not first_stations:
         raise DataError(f'{directory / RESULT}: there are no exposures of fluoroscope {first}')
     to_rig = np.eye(3) if orientation is None else orientation.rotation[0].T
     origin = np.zeros(3) if orientation is None else orientation.position_mm[0]
-    rotation = np.array([to_rig @ s.rotation for s in own])
-    translation = np.array([origin - to_rig @ s.rotation @ s.position_mm for s in own])
-    numbers = np.array([s.exposure for s in own])
+    rotation = np.array([to_rig @ s.rotation for s in first_stations])
+    translation = np.array([origin - to_rig @ s.rotation @ s.position_mm for s in first_stations])
+    numbers = np.array([s.exposure for s in first_stations])
     return Bodies((PHANTOM_BODY,), numbers, rotation[:, None], translation[:, None])

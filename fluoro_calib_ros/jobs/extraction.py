@@ -133,13 +133,13 @@ def _extract(task: _Task) -> list[ImageResult]:
     for source in task.images:
         image = source.image
         if isinstance(image, DataError):
-            found = Observations(finding=image.finding)
+            observations = Observations(finding=image.finding)
         else:
             overlays = (name,) if task.overlay else ()
-            found = follower.extract({name: image}, source.exposure, overlays)[name]
-            if found.finding is not None:
-                found = replace(found, finding=found.finding.at(source.place))
-        result = _result(found, source, task.settings)
+            observations = follower.extract({name: image}, source.exposure, overlays)[name]
+            if observations.finding is not None:
+                observations = replace(observations, finding=observations.finding.at(source.place))
+        result = _result(observations, source, task.settings)
         if task.radiographs and result.frame is not None and isinstance(image, np.ndarray):
             result = replace(result, jpeg=small_jpeg(image, RADIOGRAPH_PX))
         results.append(result)
@@ -216,17 +216,17 @@ def bent_shadows(fluoroscope: str, results: Sequence[ImageResult]) -> Finding | 
     used = [result for result in results if result.frame is not None]
     sigma = np.concatenate([result.sigma for result in used])
     bent_px = float(np.sqrt(np.mean([result.bent_px**2 for result in used])))
-    left_px = BENT_LEFT * bent_px
-    if left_px < float(np.median(sigma)) * np.sqrt(FREE_ERRORS / len(sigma)):
+    remaining_px = BENT_LEFT * bent_px
+    if remaining_px < float(np.median(sigma)) * np.sqrt(FREE_ERRORS / len(sigma)):
         return None
     return Finding(
         Kind.SHADOWS_BENT,
         f'the distortion within the large shadows shifts their centres by {bent_px:.3f} px (RMS); '
-        f'some {left_px:.3f} px of it may be left in the correction, beyond what that claims',
+        f'some {remaining_px:.3f} px of it may be left in the correction, beyond what that claims',
         Place((fluoroscope,)),
         advice='smaller beads have less of it, with the square of their size',
         severity=Severity.WARNING,
-        numbers={'bent_px': bent_px, 'left_px': left_px},
+        numbers={'bent_px': bent_px, 'left_px': remaining_px},
     )
 
 
@@ -247,8 +247,8 @@ def _first_pass(
             yield _task(request, images, lens)
 
     results: list[ImageResult] = []
-    for done in workers.map(_extract, tasks()):
-        for result in done:
+    for batch in workers.map(_extract, tasks()):
+        for result in batch:
             results.append(_with_picture_written(request, result))
             if progress is not None:
                 progress(len(results), max(sources.count, len(results)))
@@ -262,15 +262,15 @@ def _second_pass(
     results: list[ImageResult],
 ) -> None:
     """Extract refused images again with the distortion of the others; update results in place."""
-    again = {number for number, result in enumerate(results) if may_be_found(result.finding)}
+    refused = {number for number, result in enumerate(results) if may_be_found(result.finding)}
     views = [result.view for result in results if result.view is not None]
     lens = shared_lens(views[0].lens, views) if views else None
-    if lens is None or not again:
+    if lens is None or not refused:
         return
-    images = (image for number, image in enumerate(sources.images()) if number in again)
+    images = (image for number, image in enumerate(sources.images()) if number in refused)
     tasks = (_task(request, (image,), lens) for image in images)
-    done = workers.map(_extract, tasks)
-    for number, (result,) in zip(sorted(again), done):
+    extracted = workers.map(_extract, tasks)
+    for number, (result,) in zip(sorted(refused), extracted):
         if result.frame is not None:
             results[number] = _with_picture_written(request, result)
 
@@ -339,21 +339,23 @@ def recording_of_images(
         If a fluoroscope has no image with observations.
     """
     folders = fluoroscope_folders(source)
-    known = list(folders) or (list(image_topics(source)) if is_image_bag(source) else [])
-    if not known and (fluoroscopes is None or len(fluoroscopes) != 1):
+    source_names = list(folders) or (list(image_topics(source)) if is_image_bag(source) else [])
+    if not source_names and (fluoroscopes is None or len(fluoroscopes) != 1):
         raise DataError(
             f'{source}: these are images of one fluoroscope, name it with --fluoroscopes NAME; '
             'images of several are expected in a folder for each'
         )
-    names = list(fluoroscopes or known)
+    names = list(fluoroscopes or source_names)
     angles = angles or ImageAngles()
-    angles.check([source], [*names, *known])
+    angles.check([source], [*names, *source_names])
     frames: dict[str, list[Frame]] = {}
     radiographs: dict[str, dict[int, bytes]] = {}
     notes: list[str] = []
     for name in names:
-        if known and name not in known:
-            raise DataError(f'{source}: there is no fluoroscope {name!r}, only {", ".join(known)}')
+        if source_names and name not in source_names:
+            raise DataError(
+                f'{source}: there is no fluoroscope {name!r}, only {", ".join(source_names)}'
+            )
         check_safe_name(name, source)
         request = ExtractionRequest(
             [folders.get(name, source)],
@@ -386,8 +388,8 @@ def _mirrored(
 
     Two of the images are tried, none of which gives observations as it is.
     """
-    found = [result.exposure for result in results if may_be_found(result.finding)]
-    tried = set(found[:2])
+    refused = [result.exposure for result in results if may_be_found(result.finding)]
+    tried = set(refused[:2])
     for source in sources.images():
         if source.exposure not in tried or isinstance(source.image, DataError):
             continue

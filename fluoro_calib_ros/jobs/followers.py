@@ -161,9 +161,9 @@ class PhantomFollower:
 
     def _lens_of(self, size: tuple[int, int]) -> Lens:
         """Return the assumed lens. Raises DataError if the image size of a recording changes."""
-        known = self._settings.lens
-        if known is not None and known.image_size != size:
-            expected = known.image_size
+        lens = self._settings.lens
+        if lens is not None and lens.image_size != size:
+            expected = lens.image_size
             raise DataError(
                 f'the image is {size[0]} x {size[1]} px, but the first one is '
                 f'{expected[0]} x {expected[1]} px'
@@ -182,12 +182,12 @@ class PhantomFollower:
         last, view = self._track[-1]
         if number <= last + 1:
             return self._near
-        first, before = self._track[0]
-        ahead: View | None = None
+        first, view_before = self._track[0]
+        predicted: View | None = None
         if first < last:
             centre = self._model.xyz.mean(axis=0)
-            ahead = moved_on(before, view, centre, (number - last) / (last - first))
-        return replace(self._near, far=Far(ahead))
+            predicted = moved_on(view_before, view, centre, (number - last) / (last - first))
+        return replace(self._near, far=Far(predicted))
 
     def _observed(self, extraction: Extraction) -> Observations:
         return Observations(
@@ -344,14 +344,14 @@ class MarkerFollower:
             }
         out = {}
         for name, image in images.items():
-            found = exposure.views[name]
-            result = _observed(found, len(self._begun_views.trackers[name].target_id))
-            decided = [d for d in exposure.decisions if d.fluoroscope == name]
+            marker_frame = exposure.views[name]
+            result = _observed(marker_frame, len(self._begun_views.trackers[name].target_id))
+            decisions = [d for d in exposure.decisions if d.fluoroscope == name]
             earlier = self._earlier[name]
-            retracted = [one for d in decided for one in earlier.revise(d)]
-            earlier.add(found)
-            notes = [result.note, *(_decision_text(d) for d in decided if d.kind in DECIDED)]
-            picture = draw_markers(image, found) if name in overlays else None
+            retracted = [retraction for d in decisions for retraction in earlier.revise(d)]
+            earlier.add(marker_frame)
+            notes = [result.note, *(_decision_text(d) for d in decisions if d.kind in DECIDED)]
+            picture = draw_markers(image, marker_frame) if name in overlays else None
             note = '; '.join(note for note in notes if note)
             out[name] = replace(result, note=note, picture=picture, retracted=tuple(retracted))
         return out
@@ -362,16 +362,18 @@ class MarkerFollower:
         """Start with the bodies that are identified by their shapes. Raises DataError."""
         settings = self._settings
         assert settings.orientation is not None
-        found = identify_markers(
+        first_markers = identify_markers(
             images, settings.calibrations, settings.orientation, settings.bodies, angles
         )
-        self._follow({name: found.get(name) for name in settings.names})
+        self._follow({name: first_markers.get(name) for name in settings.names})
 
     def _check_start(self, exposure: ViewsFrame) -> None:
         """Accept the first exposure, or raise DataError to wait for another."""
         for name, view in exposure.views.items():
-            given = self._begun_views.trackers[name].first
-            problem = None if given is None else _wrong_start(view, len(given.target_id))
+            first_markers = self._begun_views.trackers[name].first
+            problem = (
+                None if first_markers is None else _wrong_start(view, len(first_markers.target_id))
+            )
             if problem is not None:
                 self._renew()
                 place = Place((name,)) if len(exposure.views) > 1 else Place()
@@ -381,9 +383,9 @@ class MarkerFollower:
 
 def _missing_views(names: Sequence[str]) -> Finding:
     """Return the finding that views are missing in the first exposure."""
-    several = f'views of {", ".join(names)} are' if len(names) > 1 else f'view of {names[0]} is'
+    views_text = f'views of {", ".join(names)} are' if len(names) > 1 else f'view of {names[0]} is'
     place = Place(tuple(names), name='')
-    return Finding(Kind.OTHER_VIEW_MISSING, f'the {several} missing', place)
+    return Finding(Kind.OTHER_VIEW_MISSING, f'the {views_text} missing', place)
 
 
 def _wrong_start(found: MarkerFrame, expected: int) -> Finding | None:
@@ -431,8 +433,10 @@ def _observed(found: MarkerFrame, expected: int) -> Observations:
 def _doubt_text(doubt: Finding) -> str:
     """Return a doubt in words."""
     markers = ' and '.join(map(str, doubt.place.target_id))
-    what = 'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be something else'
-    return f'markers {markers} {what}: {doubt.cause}'
+    suspicion = (
+        'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be something else'
+    )
+    return f'markers {markers} {suspicion}: {doubt.cause}'
 
 
 FollowerSettings = PhantomSettings | MarkerSettings  # picklable; calling one returns a follower

@@ -180,20 +180,20 @@ def heal_rig(
     after = rig_errors(healed.orientation, places)
     # If nothing has changed, the rig is replaced only if it may err by more than it claims.
     claims_more = after.common_mm > before.common_mm
-    now = rig if fixed else rig.healed(healed, is_other=bool(changed) or claims_more)
-    is_other = now is not rig
+    new_rig = rig if fixed else rig.healed(healed, is_other=bool(changed) or claims_more)
+    is_other = new_rig is not rig
     step(3, 4)
-    known = _correctable(fixed) if fixed else _identified(healed.weakest, bool(changed))
-    unseen = _unseen_distortion(*unseen_distortion(diagnostician, diagnosis))
-    checks = [known, _sure(diagnosis, rig), unseen]
+    identified_check = _correctable(fixed) if fixed else _identified(healed.weakest, bool(changed))
+    unseen_check = _unseen_distortion(*unseen_distortion(diagnostician, diagnosis))
+    checks = [identified_check, _sure(diagnosis, rig), unseen_check]
     if not fixed:  # otherwise they would show the same change
-        checks += _unused_exposures(now if changed else rig, unused, diagnosis, before.scale)
+        checks += _unused_exposures(new_rig if changed else rig, unused, diagnosis, before.scale)
     step(4, 4)
     return HealingOutcome(
         diagnosis,
         healed=healed if is_other else None,
-        calibrations=now.calibrations,
-        orientation=now.orientation,
+        calibrations=new_rig.calibrations,
+        orientation=new_rig.orientation,
         before=before,
         after=after if is_other else before,
         common_motion=common_motion(after.common_mm),
@@ -214,20 +214,20 @@ def _exposures_of(
 ) -> tuple[list[dict[str, Frame]], Finding | None]:
     """Return the exposures that show bodies, and a finding on their noise. Raises DataError."""
     markers = np.concatenate([body.target_id for body in bodies])
-    given = frames_of_targets(frames, markers)
-    seen, noise = with_observed_noise(
-        given, calibrations, orientation, options, must_explain=False
+    marker_frames = frames_of_targets(frames, markers)
+    frames_with_noise, noise = with_observed_noise(
+        marker_frames, calibrations, orientation, options, must_explain=False
     )
-    paired, _ = pair_recording(seen, orientation.fluoroscopes, options)
+    paired, _ = pair_recording(frames_with_noise, orientation.fluoroscopes, options)
     return paired, noise
 
 
 def _check_seen(poses: Poses) -> None:
     """Raise DataError if too few exposures give a pose of a body."""
-    seen = int(poses.known.any(axis=1).sum())
-    if seen < MIN_EXPOSURES:
+    count = int(poses.known.any(axis=1).sum())
+    if count < MIN_EXPOSURES:
         raise DataError(
-            f'{seen} of {len(poses.known)} exposures show three markers of a body in two views, '
+            f'{count} of {len(poses.known)} exposures show three markers of a body in two views, '
             f'{MIN_EXPOSURES} are needed'
         )
 
@@ -242,10 +242,10 @@ def _chosen(paired: Sequence[_Exposure]) -> tuple[list[_Exposure], list[_Exposur
         raise DataError(f'{count} exposures have two views, {MIN_EXPOSURES} are needed')
     block = np.arange(count) * BLOCKS // count
     out = []
-    for part in (0, 1):
-        rows = np.flatnonzero(block % 2 == part)
-        few = np.unique(np.linspace(0, len(rows) - 1, MAX_EXPOSURES).astype(int))
-        out.append([paired[row] for row in rows[few]])
+    for parity in (0, 1):
+        rows = np.flatnonzero(block % 2 == parity)
+        sample = np.unique(np.linspace(0, len(rows) - 1, MAX_EXPOSURES).astype(int))
+        out.append([paired[row] for row in rows[sample]])
     return out[0], out[1]
 
 
@@ -272,8 +272,10 @@ class _Rig:
         for f, name in enumerate(names):
             for row, exposure in enumerate(exposures):
                 if name in exposure:
-                    own, found = _corrected(target_id, exposure[name], self.calibrations[name])
-                    flat[row, own, f] = found
+                    marker_rows, marker_values = _corrected(
+                        target_id, exposure[name], self.calibrations[name]
+                    )
+                    flat[row, marker_rows, f] = marker_values
         pixel = values[..., :2]
         uv = values[..., 2:4]
         sigma, correction = np.moveaxis(values[..., 4:], -1, 0)
@@ -296,16 +298,18 @@ class _Rig:
         known = good.sum(axis=2) >= 3
         rotation = np.tile(np.eye(3), (*shape[:2], 1, 1))
         centre = np.zeros((*shape[:2], 3))
-        own = self.adjustment().xyz
+        body_xyz = self.adjustment().xyz
         for t, b in np.argwhere(known):
             rows = np.flatnonzero(good[t, b])
-            rotation[t, b], centre[t, b] = robust_pose(own[b, rows], xyz[t, b, rows])
+            rotation[t, b], centre[t, b] = robust_pose(body_xyz[b, rows], xyz[t, b, rows])
         return Poses(rotation, centre, known)
 
     def with_fixed_correction(self, changes: Iterable[Change]) -> list[str]:
         """Return fluoroscopes whose distortion has changed, but whose model allows no change."""
         names = self.orientation.fluoroscopes
-        distorted = [names[one.fluoroscope] for one in changes if one.cause is Cause.DISTORTION]
+        distorted = [
+            names[change.fluoroscope] for change in changes if change.cause is Cause.DISTORTION
+        ]
         return [name for name in distorted if self.calibrations[name].model.series is None]
 
     def healed(self, healed: HealedRig, is_other: bool) -> _Rig:
@@ -316,21 +320,21 @@ class _Rig:
         calibrations = dict(self.calibrations)
         names = self.orientation.fluoroscopes
         for f, name in enumerate(names):
-            one = calibrations[name]
+            calibration = calibrations[name]
             if f in healed.drift:
                 functions, coefficients, covariance = healed.drift[f]
                 sd = sd_over_image(functions, covariance)
-                one = with_drift(one, functions, coefficients, sd)
+                calibration = with_drift(calibration, functions, coefficients, sd)
             else:
-                one = with_larger_sd(one, sd_over_image(*healed.unseen[f]))
+                calibration = with_larger_sd(calibration, sd_over_image(*healed.unseen[f]))
             if healed.changes[f, 6:].any():
                 rows = healed.orientation.covariance_rows([f])[6:]
-                one = replace(
-                    one,
+                calibration = replace(
+                    calibration,
                     interior=healed.orientation.interior[f],
                     interior_covariance=healed.orientation.covariance[np.ix_(rows, rows)],
                 )
-            calibrations[name] = one
+            calibrations[name] = calibration
         if not is_other and ids_of(calibrations) == ids_of(self.calibrations):
             return self
         orientation = replace(
@@ -355,8 +359,8 @@ class _Rig:
         target_id = self.adjustment().target_id
         left_out = _left_out(known.changes, target_id)
         observed = observed.without(left_out)
-        told = poses.known[:, _solvable(target_id, left_out)]
-        if told.any(axis=1).sum() < MIN_EXPOSURES:
+        known_poses = poses.known[:, _solvable(target_id, left_out)]
+        if known_poses.any(axis=1).sum() < MIN_EXPOSURES:
             return None
         return Diagnostician(self.adjustment(), shape_scale).diagnose(observed, poses, OF_RIG)
 
@@ -386,14 +390,16 @@ def _corrected(
 
     Image points beyond the calibrated area are excluded.
     """
-    _, own, given = np.intersect1d(target_id.ravel(), frame.target_id, return_indices=True)
-    observed = frame.uv[given]
-    sigma = None if frame.sigma is None else frame.sigma[given]
+    _, target_rows, frame_rows = np.intersect1d(
+        target_id.ravel(), frame.target_id, return_indices=True
+    )
+    observed = frame.uv[frame_rows]
+    sigma = None if frame.sigma is None else frame.sigma[frame_rows]
     u, v, total, sd, status = calibration.correct_arrays(
         observed[:, 0], observed[:, 1], sigma, frame.angle
     )
     inside = status == CorrectionStatus.OK
-    return own[inside], np.column_stack([observed, u, v, total, sd])[inside]
+    return target_rows[inside], np.column_stack([observed, u, v, total, sd])[inside]
 
 
 # Findings and checks of a healing.
@@ -496,14 +502,14 @@ def _correctable(fixed: Sequence[str]) -> Check:
 
 def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
     """Check that no other cause explains the data nearly as well."""
-    doubt = max([1 - one for one in diagnosis.probability], default=0.0)
+    doubt = max([1 - probability for probability in diagnosis.probability], default=0.0)
     limit = 1 - SURE_OF_CAUSE
     text = 'no other cause explains the recording as well'
     if doubt > limit:
         worst = int(np.argmin(diagnosis.probability))
         rival = diagnosis.rivals[worst]
-        found = _finding(diagnosis.changes[worst], rig, diagnosis)
-        text = f'{found.place}: {found.cause}'
+        finding = _finding(diagnosis.changes[worst], rig, diagnosis)
+        text = f'{finding.place}: {finding.cause}'
         if rival is not None:
             text += f'; or {_place_of(rival, rig)}: {_cause_text(rival, rig)}'
         text += '; the recording does not tell which'
@@ -601,7 +607,7 @@ def healing_document(outcome: HealingOutcome, parent: RigOrientation) -> dict[st
         'exposures': outcome.exposures,
         'noise_factor': outcome.diagnosis.noise,
         'nothing_else_probability': outcome.diagnosis.rest,
-        'findings': [_finding_document(one) for one in outcome.findings],
+        'findings': [_finding_document(finding) for finding in outcome.findings],
         'checks': [
             {
                 **_finding_document(check),

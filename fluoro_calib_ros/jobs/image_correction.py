@@ -86,12 +86,14 @@ def run_image_correction(
         raise DataError(f'{request.source}: angles are those of the images of one file')
     folder = list_images(request.source, request.recursive)
     with folder_like(request.out, folder) as temporary:
-        done = list(_corrected_files(request, folder, temporary, progress))
-        images = sum(one.images for one in done)
-        failed = tuple(one.problem for one in done if one.problem)
+        outcomes = list(_corrected_files(request, folder, temporary, progress))
+        images = sum(outcome.images for outcome in outcomes)
+        failed = tuple(outcome.problem for outcome in outcomes if outcome.problem)
         if not images:
-            raise DataError(f'none of {len(done)} files can be corrected, {failed[0]}')
-    return CorrectedImages('folder', images, len(done) - len(failed), folder.passed_over, failed)
+            raise DataError(f'none of {len(outcomes)} files can be corrected, {failed[0]}')
+    return CorrectedImages(
+        'folder', images, len(outcomes) - len(failed), folder.passed_over, failed
+    )
 
 
 def _correct_by_angle(
@@ -112,16 +114,18 @@ def _corrected_files(
     """Correct the files of a folder into another. Raises DataError, unless keep_going is set."""
     # Absolute paths, valid for workers with another working directory.
     source = Path(os.path.abspath(folder.path))
-    tasks = [_Task(source / one, out / new) for one, new in zip(folder.files, folder.written)]
+    tasks = [
+        _Task(source / file, out / target) for file, target in zip(folder.files, folder.written)
+    ]
     correct = partial(_correct_file, request.calibration, request.interpolation)
     with open_workers(_count(request, folder), request.scheduler, len(tasks)) as workers:
-        for number, done in enumerate(workers.map(correct, tasks), 1):
-            problem = done.problem.replace(str(out), str(request.out))
+        for number, outcome in enumerate(workers.map(correct, tasks), 1):
+            problem = outcome.problem.replace(str(out), str(request.out))
             if problem and request.scheduler is not None:
                 problem += ' (seen by a worker of the cluster)'
             if problem and not request.keep_going:
                 raise DataError(problem)
-            yield replace(done, problem=problem)
+            yield replace(outcome, problem=problem)
             if progress is not None:
                 progress(number, len(tasks))
 
@@ -131,8 +135,8 @@ def _count(request: ImageCorrectionRequest, folder: ImageFolder) -> int:
     if request.workers:
         return request.workers
     videos = sum(suffix_of(path) in VIDEO_SUFFIXES for path in folder.files)
-    worth = videos + (len(folder.files) - videos) // PER_PROCESS
-    return min(max(worth, 1), os.cpu_count() or 1)
+    process_count = videos + (len(folder.files) - videos) // PER_PROCESS
+    return min(max(process_count, 1), os.cpu_count() or 1)
 
 
 _correctors: dict[tuple[str, str], ImageCorrector] = {}  # the last corrector of this process

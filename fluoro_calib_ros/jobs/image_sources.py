@@ -156,19 +156,19 @@ def dose_texts(source: Path) -> dict[str, str]:
     texts = {}
     for name, folder in (fluoroscope_folders(source) or {'': source}).items():
         files = sorted(folder.iterdir()) if folder.is_dir() else [folder]
-        told = [
+        doses = [
             _dose(path, path.stat().st_mtime_ns)
             for path in files
             if image_suffix_of(path) in DICOM_SUFFIXES
         ]
         sums = []
-        for values, unit in zip(zip(*told), ('mAs', 'dGy cm2')):
-            known = [value for value in values if value is not None]
-            if known:
-                part = '' if len(known) == len(told) else f' in {len(known)} of them'
-                sums.append(f'{sum(known):.4g} {unit}{part}')
+        for values, unit in zip(zip(*doses), ('mAs', 'dGy cm2')):
+            stated = [value for value in values if value is not None]
+            if stated:
+                part = '' if len(stated) == len(doses) else f' in {len(stated)} of them'
+                sums.append(f'{sum(stated):.4g} {unit}{part}')
         if sums:
-            count = f'{len(told)} DICOM files' if len(told) > 1 else '1 DICOM file'
+            count = f'{len(doses)} DICOM files' if len(doses) > 1 else '1 DICOM file'
             texts[name] = f'{count}: {", ".join(sums)}'
     return texts
 
@@ -186,26 +186,26 @@ def _dose(path: Path, changed_ns: int) -> tuple[float | None, float | None]:
 def contains_images(source: Path) -> bool:
     """Return whether a source is an image, a folder of images, a video, or a bag of images."""
     if source.is_dir() and not (source / METADATA).exists():
-        direct = any(image_suffix_of(path) in EXPOSURE_SUFFIXES for path in source.iterdir())
-        if direct or fluoroscope_folders(source):
+        has_images = any(image_suffix_of(path) in EXPOSURE_SUFFIXES for path in source.iterdir())
+        if has_images or fluoroscope_folders(source):
             return True
     if not is_bag(source):
         return not source.is_dir() and bool(image_suffix_of(source))
     try:
-        known = [info.type for info in topics_of(source).values()]
-        return TARGET_OBSERVATIONS not in known and bool(image_topics(source))
+        types = [info.type for info in topics_of(source).values()]
+        return TARGET_OBSERVATIONS not in types and bool(image_topics(source))
     except DataError:
         return False  # the reader of bags reports the reason
 
 
 def _images_in(folder: Path) -> list[Path]:
     """Return the images of a folder, ordered by number and name. Raises DataError if none."""
-    found = [path for path in folder.iterdir() if image_suffix_of(path) in EXPOSURE_SUFFIXES]
-    if not found:
+    images = [path for path in folder.iterdir() if image_suffix_of(path) in EXPOSURE_SUFFIXES]
+    if not images:
         raise DataError(
             f'{folder}: there are no images in this folder ({listed(EXPOSURE_SUFFIXES)})'
         )
-    return sorted(found, key=lambda path: (_number(path) is None, _number(path) or 0, path.name))
+    return sorted(images, key=lambda path: (_number(path) is None, _number(path) or 0, path.name))
 
 
 def _number(path: Path) -> int | None:

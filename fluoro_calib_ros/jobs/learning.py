@@ -78,17 +78,17 @@ def learn_shapes(
     recorded = orientation_of_recorded(frames, orientation)
     markers = np.concatenate([body.target_id for body in bodies])
     seen = frames_of_targets(frames, markers)
-    found = intersected(seen, calibrations, recorded, options, progress)
-    exposures = found.exposures
-    drift = found.drift
+    recording = intersected(seen, calibrations, recorded, options, progress)
+    exposures = recording.exposures
+    drift = recording.drift
     if drift.state is not None:
         raise DataError(replace(drift.finding, advice='no shapes are learned in a drift'))
-    shapes = estimated_shapes(bodies, found)
+    shapes = estimated_shapes(bodies, recording)
     learned = [_known(shape.body) for shape in shapes if _is_good(shape)]
     findings = [finding for shape in shapes for finding in shape.findings]
     if not learned:
         raise DataError(
-            *[one for one in findings if one.kind in REFUSED],
+            *[finding for finding in findings if finding.kind in REFUSED],
             f'no body has a shape from {MIN_EXPOSURES} exposures or more, none is learned',
         )
     return LearnedShapes(
@@ -121,7 +121,7 @@ def learned_for(directory: PathLike, orientation: RigOrientation) -> LearnedShap
 def _is_good(shape: EstimatedShape) -> bool:
     """Return whether a shape may be compared with later observations of a rig."""
     enough = shape.exposures >= MIN_EXPOSURES and int(shape.body.known.sum()) >= 3
-    return enough and not any(one.kind in REFUSED for one in shape.findings)
+    return enough and not any(finding.kind in REFUSED for finding in shape.findings)
 
 
 def _known(body: Body) -> Body:

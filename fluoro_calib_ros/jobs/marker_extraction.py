@@ -112,19 +112,19 @@ class MarkerOutcome:
         out = []
         for name, results in self.results.items():
             for result in results:
-                found = result.markers
-                if not len(found.target_id):
+                markers = result.markers
+                if not len(markers.target_id):
                     continue
                 frame = Frame(
                     name,
                     result.exposure,
-                    found.target_id,
-                    found.uv,
+                    markers.target_id,
+                    markers.uv,
                     self.image_size[name],
-                    sigma=found.sigma,
+                    sigma=markers.sigma,
                     angle=result.angle,
                 )
-                out.append((frame, found.overlapped, found.doubtful))
+                out.append((frame, markers.overlapped, markers.doubtful))
         return out
 
     def spans(self) -> list[DoubtfulSpan]:
@@ -134,14 +134,14 @@ class MarkerOutcome:
             open_spans: dict[int, DoubtfulSpan] = {}
             causes: dict[int, Finding] = {}
             for result in results:
-                found = result.markers
-                for doubt in found.doubts:
+                markers = result.markers
+                for doubt in markers.doubts:
                     for target in doubt.place.target_id:
                         causes[target] = doubt
-                for target in found.target_id[~found.doubtful].tolist():
+                for target in markers.target_id[~markers.doubtful].tolist():
                     if target in open_spans:
                         out.append(open_spans.pop(target))
-                for target in found.target_id[found.doubtful].tolist():
+                for target in markers.target_id[markers.doubtful].tolist():
                     span = open_spans.get(target)
                     if span is None:
                         cause = causes.get(target)
@@ -274,7 +274,7 @@ class _Recording:
 
     def _first_exposure(self) -> int:
         """Return the first exposure with given markers of all fluoroscopes. Raises DataError."""
-        common = set.intersection(*(set(of_view) for of_view in self._given.values()))
+        common = set.intersection(*(set(frames) for frames in self._given.values()))
         if not common:
             raise DataError(
                 f'the markers of {" and ".join(self._names)} are not given for the same exposure'
@@ -285,12 +285,12 @@ class _Recording:
         """Track the markers through the images of one exposure, by fluoroscope."""
         exposure = next(iter(images.values())).exposure
         if self._follower is None:
-            first = self._first_markers(images, exposure)
-            if not first:
+            first_markers = self._first_markers(images, exposure)
+            if not first_markers:
                 for name in images:
                     self._before[name] += 1
                 return
-            self._follower = self._begin(images, first)
+            self._follower = self._begin(images, first_markers)
         for name in images if self._results[self._names[0]] else ():
             if exposure in self._given[name]:
                 self._follower.place(name, self._markers(name, exposure))
@@ -298,12 +298,12 @@ class _Recording:
             name: None if isinstance(image.image, DataError) else image.image
             for name, image in images.items()
         }
-        found = self._follower.update(arrays, exposure, _angles_of(images))
-        self._decisions += found.decisions
-        for decision in found.decisions:
+        views_frame = self._follower.update(arrays, exposure, _angles_of(images))
+        self._decisions += views_frame.decisions
+        for decision in views_frame.decisions:
             self._earlier[decision.fluoroscope].revise(decision)
         for name, image in images.items():
-            view = found.views[name]
+            view = views_frame.views[name]
             if isinstance(image.image, DataError):
                 view = replace(view, finding=image.image.finding)
             result = MarkerImageResult(exposure, image.place, view, image.angle)
@@ -332,7 +332,9 @@ class _Recording:
         """Return ids of markers that are given for exposures after the first."""
         if self._start is None:
             return ()
-        frames = [f for of_view in self._given.values() for f in of_view.values()]
+        frames = [
+            f for frames_by_number in self._given.values() for f in frames_by_number.values()
+        ]
         ids = [frame.target_id for frame in frames if frame.number > self._start]
         return tuple(np.unique(np.concatenate(ids)).tolist()) if ids else ()
 
@@ -343,17 +345,17 @@ class _Recording:
         arrays = {name: image.image for name, image in images.items()}
         self._tries += 1
         try:
-            whole = {n: a for n, a in arrays.items() if not isinstance(a, DataError)}
-            if len(whole) < len(arrays):
+            readable = {n: a for n, a in arrays.items() if not isinstance(a, DataError)}
+            if len(readable) < len(arrays):
                 return {}
-            found = identify_markers(
-                whole,
+            first_markers = identify_markers(
+                readable,
                 request.calibrations,
                 request.orientation,
                 request.bodies,
                 _angles_of(images),
             )
-            return {name: found.get(name) for name in self._names}
+            return {name: first_markers.get(name) for name in self._names}
         except DataError as error:
             self._reason = self._reason or str(error)
             if self._tries >= MAX_TRIES:
@@ -431,13 +433,15 @@ def _exposures(sources: Mapping[str, ImageSources]) -> Iterator[dict[str, Source
     readers = {name: _ahead(source.images()) for name, source in sources.items()}
     waiting = {name: next(reader, None) for name, reader in readers.items()}
     while True:
-        there = {name: image for name, image in waiting.items() if image is not None}
-        if not there:
+        next_images = {name: image for name, image in waiting.items() if image is not None}
+        if not next_images:
             return
-        exposure = min(image.exposure for image in there.values())
-        now = {name: image for name, image in there.items() if image.exposure == exposure}
-        yield now
-        for name in now:
+        exposure = min(image.exposure for image in next_images.values())
+        exposure_images = {
+            name: image for name, image in next_images.items() if image.exposure == exposure
+        }
+        yield exposure_images
+        for name in exposure_images:
             waiting[name] = next(readers[name], None)
 
 
@@ -463,9 +467,11 @@ def _write_pictures(
     """Write a picture of every readable image with the final ids."""
     assert request.overlay is not None
     for name, source in sources.items():
-        found = {result.exposure: result.markers for result in outcome.results[name]}
+        markers_by_exposure = {result.exposure: result.markers for result in outcome.results[name]}
         for image in source.counted(progress):
-            if image.exposure in found and not isinstance(image.image, DataError):
-                picture = draw_markers(image.image, found[image.exposure], request.target_names)
+            if image.exposure in markers_by_exposure and not isinstance(image.image, DataError):
+                picture = draw_markers(
+                    image.image, markers_by_exposure[image.exposure], request.target_names
+                )
                 path = request.overlay / f'{name}_{image.exposure:04d}.png'
                 write_bytes(path, cv2.imencode('.png', picture)[1].tobytes())

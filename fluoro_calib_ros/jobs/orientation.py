@@ -84,8 +84,8 @@ def orient(
     """
     require_phantom(frames, phantom)
     orientation = orientation_of_capture(frames, phantom, calibrations, frame_id)
-    found = _intersected(frames, calibrations, orientation)
-    met = _met(found, phantom)
+    reconstructed = _intersected(frames, calibrations, orientation)
+    met = _met(reconstructed, phantom)
     if not met.is_good and _fits_uncorrected(frames, phantom, calibrations, frame_id):
         raise DataError(
             'the image points are corrected already, their rays meet without the correction '
@@ -93,7 +93,7 @@ def orient(
             kind=Kind.CORRECTED_ALREADY,
             advice='give the observed ones',
         )
-    offset = found.points.xyz_mm - phantom.xyz_mm[phantom.index(found.target_id)]
+    offset = reconstructed.points.xyz_mm - phantom.xyz_mm[phantom.index(reconstructed.target_id)]
     offset = offset[np.isfinite(offset).all(axis=1)]
     rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))) if len(offset) else float('nan')
     findings = (_doubt(met), _change(present, orientation))
@@ -137,8 +137,8 @@ def _met(found: ReconstructedFrame, phantom: Phantom) -> _Met:
     met = np.isfinite(offset).all(axis=1)
     if not met.any():
         return _Met(matched, 0, np.nan)
-    spread = phantom.sd_mm[rows[met]] ** 2
-    covariance = points.covariance[met] + spread[:, None, None] * np.eye(3)
+    survey_variance = phantom.sd_mm[rows[met]] ** 2
+    covariance = points.covariance[met] + survey_variance[:, None, None] * np.eye(3)
     scaled = np.linalg.solve(covariance, offset[met][:, :, None])[:, :, 0]
     square = np.einsum('ni,ni->n', offset[met], scaled)
     return _Met(matched, int(met.sum()), float(np.sqrt(np.median(square) / chdtri(3, 0.5))))
@@ -150,10 +150,10 @@ def _fits_uncorrected(
     """Return whether a capture fits the calibrations without their corrections."""
     if not any(calibrations[name].model.corrects for name in frames):
         return False
-    plain = uncorrected(calibrations)
+    without_correction = uncorrected(calibrations)
     try:
-        orientation = orientation_of_capture(frames, phantom, plain, frame_id)
-        return _met(_intersected(frames, plain, orientation), phantom).is_good
+        orientation = orientation_of_capture(frames, phantom, without_correction, frame_id)
+        return _met(_intersected(frames, without_correction, orientation), phantom).is_good
     except DataError:
         return False
 
@@ -165,7 +165,7 @@ def _doubt(met: _Met) -> Finding | None:
     """
     if met.is_good:
         return None
-    found = Finding(
+    finding = Finding(
         Kind.RAYS_DO_NOT_MEET,
         f'the rays of only {met.met} of {met.matched} targets in two views meet',
         advice='the fluoroscopes are interchanged, their calibrations do not hold for these '
@@ -173,12 +173,12 @@ def _doubt(met: _Met) -> Finding | None:
         numbers={'met': met.met, 'matched': met.matched, 'ratio': met.ratio},
     )
     if met.met < MIN_MET * met.matched:
-        raise DataError(found)
+        raise DataError(finding)
     cause = (
         f'doubtful: the rays of {met.met} of {met.matched} targets in two views meet, '
         f'{met.ratio:.1f} times as far from their survey as expected'
     )
-    return replace(found, cause=cause, severity=Severity.WARNING)
+    return replace(finding, cause=cause, severity=Severity.WARNING)
 
 
 def _change(present: RigOrientation | None, new: RigOrientation) -> Finding | None:
@@ -191,13 +191,13 @@ def _change(present: RigOrientation | None, new: RigOrientation) -> Finding | No
         shifts = [
             o.rotation[first] @ (o.position_mm[b] - o.position_mm[first]) for o in (present, new)
         ]
-        base = float(np.linalg.norm(shifts[0]))
+        baseline = float(np.linalg.norm(shifts[0]))
         moved = float(np.linalg.norm(shifts[1] - shifts[0]))
         turned = float(rotation_angle(turns[1] @ turns[0].T))
-        if moved > MAX_SHIFT * base or turned > MAX_TURN_RAD:
+        if moved > MAX_SHIFT * baseline or turned > MAX_TURN_RAD:
             names = (new.fluoroscopes[first], new.fluoroscopes[b])
             turned_deg = float(np.rad2deg(turned))
-            scale = float(np.linalg.norm(shifts[1])) / base
+            scale = float(np.linalg.norm(shifts[1])) / baseline
             return Finding(
                 Kind.RIG_MOVED,
                 f'fluoroscopes {" and ".join(names)} stand otherwise to each other than in the '

@@ -157,7 +157,7 @@ def reconstruct(
     watch, drift = _drift_watch(orientation, calibrations, options)
     scatter = ObservedScatter()
     intersector = Intersector(orientation, options.reject)
-    found, unpaired = reconstruct_recording(
+    reconstructed, unpaired = reconstruct_recording(
         frames,
         calibrations,
         intersector=intersector,
@@ -166,20 +166,20 @@ def reconstruct(
         scatter=scatter,
         progress=progress,
     )
-    if not found:
+    if not reconstructed:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
-    wrong = mismatch(found, frames, calibrations, intersector, options)
-    if wrong is not None:
-        raise DataError(wrong)
+    finding = mismatch(reconstructed, frames, calibrations, intersector, options)
+    if finding is not None:
+        raise DataError(finding)
     cause = None
     if scatter.factor >= MAX_WIDENING:
-        cause = cause_of_misses(found, frames, calibrations, intersector, options)
+        cause = cause_of_misses(reconstructed, frames, calibrations, intersector, options)
     disagreement = ''
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
     drift = watch.verdict() if watch else drift
     return ReconstructionOutcome(
-        found,
+        reconstructed,
         unpaired,
         orientation=orientation,
         drift=drift,
@@ -202,11 +202,11 @@ def _drift_watch(
     if not options.drift_watch:
         return None, None
     if not options.has_stamps:
-        why = 'the file does not contain the times of its exposures, a drift cannot be detected'
-        return None, DriftVerdict(Finding(Kind.NOT_WATCHED, why, severity=Severity.WARNING))
+        cause = 'the file does not contain the times of its exposures, a drift cannot be detected'
+        return None, DriftVerdict(Finding(Kind.NOT_WATCHED, cause, severity=Severity.WARNING))
     sizes = {name: calibrations[name].image_size for name in orientation.fluoroscopes}
     try:
         return RecordingDriftWatch(orientation, sizes, bodies=options.bodies), None
     except DataError as error:
-        why = f'a drift cannot be detected: {error}'
-        return None, DriftVerdict(Finding(Kind.NOT_WATCHED, why, severity=Severity.WARNING))
+        cause = f'a drift cannot be detected: {error}'
+        return None, DriftVerdict(Finding(Kind.NOT_WATCHED, cause, severity=Severity.WARNING))

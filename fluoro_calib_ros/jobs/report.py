@@ -62,13 +62,13 @@ def compare_folders(first: PathLike, second: PathLike) -> ComparedFolders:
 
     Raises DataError if there are none, and for calibrations that cannot be compared.
     """
-    one = load_calibrations(first)
-    other = load_calibrations(second)
-    common = [name for name in one if name in other]
+    first_calibrations = load_calibrations(first)
+    second_calibrations = load_calibrations(second)
+    common = [name for name in first_calibrations if name in second_calibrations]
     if not common:
         raise DataError(
-            f'{second}: there are calibrations of {", ".join(other)}, and in {first} of '
-            f'{", ".join(one)}: no fluoroscope is in both'
+            f'{second}: there are calibrations of {", ".join(second_calibrations)}, and in '
+            f'{first} of {", ".join(first_calibrations)}: no fluoroscope is in both'
         )
     findings = [
         Finding(
@@ -77,13 +77,23 @@ def compare_folders(first: PathLike, second: PathLike) -> ComparedFolders:
             Place((name,), name=''),
             severity=Severity.NOTE,
         )
-        for folder, own, foreign in ((first, one, other), (second, other, one))
-        for name in own
-        if name not in foreign
+        for folder, names, other_names in (
+            (first, first_calibrations, second_calibrations),
+            (second, second_calibrations, first_calibrations),
+        )
+        for name in names
+        if name not in other_names
     ]
-    comparisons = {name: compare_calibrations(one[name], other[name]) for name in common}
+    comparisons = {
+        name: compare_calibrations(first_calibrations[name], second_calibrations[name])
+        for name in common
+    }
     distances = _distances(Path(first))
-    scales = {n: distances[n] / float(one[n].interior[2]) for n in common if n in distances}
+    scales = {
+        n: distances[n] / float(first_calibrations[n].interior[2])
+        for n in common
+        if n in distances
+    }
     return ComparedFolders(comparisons, scales, tuple(findings))
 
 
@@ -91,12 +101,12 @@ def _distances(directory: Path) -> dict[str, float]:
     """Return the median distance of the phantom from the source, by fluoroscope [mm]."""
     if not (directory / RESULT).exists():
         return {}
-    found: dict[str, list[float]] = {}
+    distances: dict[str, list[float]] = {}
     for station in stations_of(directory / RESULT):
-        found.setdefault(station.fluoroscope, []).append(
+        distances.setdefault(station.fluoroscope, []).append(
             float(np.linalg.norm(station.position_mm))
         )
-    return {name: float(np.median(values)) for name, values in found.items()}
+    return {name: float(np.median(values)) for name, values in distances.items()}
 
 
 # Exceptions raised by reading a damaged result.
@@ -126,10 +136,10 @@ def write_report(directory: PathLike, progress: Callable[[int, int], object] | N
     folder that is not the result of a calibration, and if the file cannot be written.
     """
     path = Path(directory) / REPORT
-    given = read_report_input(directory)
+    report_input = read_report_input(directory)
     try:
         with np.errstate(all='ignore'):  # a damaged result may contain huge numbers
-            text = report_html(given, progress)
+            text = report_html(report_input, progress)
     except NOT_A_RESULT as error:
         raise _not_a_result(directory, error) from None
     write_text(path, text)
@@ -155,37 +165,38 @@ def read_report_input(directory: PathLike) -> ReportInput:
     result = read_json(directory / RESULT)
     if not isinstance(result.get('fluoroscopes'), Mapping) or 'targets' not in result:
         raise DataError(f'{directory / RESULT}: this is not the result of a calibration')
-    present = {name: c for name, c in calibrations.items() if name in result['fluoroscopes']}
-    if not present:
+    reported = {name: c for name, c in calibrations.items() if name in result['fluoroscopes']}
+    if not reported:
         raise DataError(f'{directory / RESULT}: there are no figures of {", ".join(calibrations)}')
-    mixed = exchanged(directory, result, present)
+    mixed = exchanged(directory, result, reported)
     if mixed is not None:
         raise DataError(mixed)
-    request = read_request(directory, present)
+    request = read_request(directory, reported)
     orientation = saved_orientation(directory)
     if orientation is not None and not belongs_to(orientation, calibrations):
         orientation = None
     verdict = read_result(directory, VALIDATION_NAME)
-    if verdict.get('calibration_id') != ids_of(present):
+    if verdict.get('calibration_id') != ids_of(reported):
         verdict = {}
     changed = changed_since_verdict(directory, verdict)
-    when = datetime.fromtimestamp((directory / RESULT).stat().st_mtime, timezone.utc)
+    written_at = datetime.fromtimestamp((directory / RESULT).stat().st_mtime, timezone.utc)
     return ReportInput(
         directory.resolve().name,
         result,
-        calibrations=present,
+        calibrations=reported,
         frames=request.frames,
         phantom=request.phantom,
         settings=read_json(directory / OPTIONS),
         validation=verdict if verdict and not changed else None,
         orientation=orientation,
         names=read_names(directory),
-        written=when.strftime('%Y-%m-%d %H:%M UTC'),
+        written=written_at.strftime('%Y-%m-%d %H:%M UTC'),
         rig_note=saved_rig_note(directory),
         edited=edited(directory, result) or changed,
-        space=_accuracy_in_space(request, present, orientation),
+        space=_accuracy_in_space(request, reported, orientation),
         radiographs=read_radiographs(
-            directory, ((name, f.number) for name, own in request.frames.items() for f in own)
+            directory,
+            ((name, f.number) for name, frames in request.frames.items() for f in frames),
         ),
     )
 
@@ -198,10 +209,10 @@ def _accuracy_in_space(
         return None
     options = ReconstructionOptions(drift_watch=False)
     try:
-        found = reconstruct(request.frames, calibrations, orientation, options)
+        outcome = reconstruct(request.frames, calibrations, orientation, options)
     except DataError:  # such as exposures without partner: the verdict reports the reason
         return None
-    return accuracy_in_space(found.frames, request.phantom)
+    return accuracy_in_space(outcome.frames, request.phantom)
 
 
 # Printing a report as PDF with a browser of this machine.
@@ -224,8 +235,8 @@ PDF_START = b'%PDF-'
 
 def find_browser() -> str | None:
     """Return a browser that can print without a window, or None."""
-    known = (os.path.expandvars(place) for place in PLACES)
-    return next(filter(None, map(shutil.which, (*BROWSERS, *known))), None)
+    paths = (os.path.expandvars(place) for place in PLACES)
+    return next(filter(None, map(shutil.which, (*BROWSERS, *paths))), None)
 
 
 def print_page(page: PathLike, out: PathLike) -> None:
@@ -238,22 +249,22 @@ def print_page(page: PathLike, out: PathLike) -> None:
         )
     with tempfile.TemporaryDirectory() as folder:
         printed = Path(folder) / 'page.pdf'
-        words = [
+        command = [
             *(browser, '--headless', '--disable-gpu', '--no-first-run', '--no-pdf-header-footer'),
             *(f'--user-data-dir={folder}/profile', f'--print-to-pdf={printed}'),
             Path(page).resolve().as_uri(),
         ]
         if hasattr(os, 'geteuid') and os.geteuid() == 0:
-            words.insert(
+            command.insert(
                 1, '--no-sandbox'
             )  # browsers refuse to run sandboxed as root, as in containers
         try:
-            done = subprocess.run(words, capture_output=True, timeout=300, check=False)
+            process = subprocess.run(command, capture_output=True, timeout=300, check=False)
             content = printed.read_bytes() if printed.exists() else b''
         except (OSError, subprocess.TimeoutExpired) as error:
             raise DataError(f'{out}: {browser} does not print the report ({error})') from None
     if not content.startswith(PDF_START):
-        said = done.stderr.decode(errors='replace').strip().splitlines()
-        cause = said[-1] if said else f'exit status {done.returncode}'
+        error_lines = process.stderr.decode(errors='replace').strip().splitlines()
+        cause = error_lines[-1] if error_lines else f'exit status {process.returncode}'
         raise DataError(f'{out}: {browser} does not print the report ({cause})')
     write_bytes(out, content)

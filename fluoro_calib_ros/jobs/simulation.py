@@ -108,14 +108,14 @@ def write_exposures(
     directory = Path(directory)
     write_bag(directory / name, simulated.frames)
     write_observations_csv(directory / f'{name}.csv', simulated.frames)
-    perfect = {
+    undistorted_frames = {
         fluoroscope: [
             Frame(f.fluoroscope, f.number, f.target_id, np.round(uv, 6), f.image_size)
             for f, uv in zip(frames, simulated.undistorted[fluoroscope])
         ]
         for fluoroscope, frames in simulated.frames.items()
     }
-    write_observations_csv(directory / TRUTH / f'{name}_undistorted.csv', perfect)
+    write_observations_csv(directory / TRUTH / f'{name}_undistorted.csv', undistorted_frames)
     rows: list[list[object]] = []
     for fluoroscope in rig.fluoroscopes:
         numbers = [frame.number for frame in simulated.frames[fluoroscope.name]]
@@ -151,8 +151,8 @@ def write_radiographs(
             write_bytes(folder / f'{frame.number:04d}.png', encode(image, '.png'))
             centres = radiography.centres(rig.true_mm, pose)
             seen = np.flatnonzero(radiography.in_field(centres))
-            begin = (fluoroscope.name, frame.number)
-            rows += _rows(begin, rig.phantom.target_id[seen], centres[seen], 4)
+            prefix = (fluoroscope.name, frame.number)
+            rows += _rows(prefix, rig.phantom.target_id[seen], centres[seen], 4)
             done += 1
             if progress is not None:
                 progress(done, total)
@@ -182,8 +182,8 @@ def write_marker_radiographs(
         for name, view in views.items():
             path = directory / MARKER_IMAGES / name / f'{number:04d}.png'
             write_bytes(path, encode(view.image, '.png'))
-            of_view = _rows((name, number), markers.target_id, view.uv, 4)
-            rows += ([*row, int(seen)] for row, seen in zip(of_view, view.seen))
+            view_rows = _rows((name, number), markers.target_id, view.uv, 4)
+            rows += ([*row, int(seen)] for row, seen in zip(view_rows, view.seen))
         points += _rows([number], markers.target_id, markers.points_mm(number), 6)
         if number == 1:
             write_observations_csv(directory / FIRST_MARKERS, _first_markers(views, markers))
@@ -453,9 +453,11 @@ def _write(
     if settings is not None:
         write_radiographs(directory, rig, calibration, settings, progress)
     if options.marker_images:
-        moving = MovingMarkers(MarkerScene(), options.seed)
-        taken = MARKER_SETTINGS if options.images != 'hard' else HARD_MARKER_SETTINGS
-        sequence = MarkerSequence(rig, moving, taken, options.marker_images, options.seed)
+        markers = MovingMarkers(MarkerScene(), options.seed)
+        image_settings = MARKER_SETTINGS if options.images != 'hard' else HARD_MARKER_SETTINGS
+        sequence = MarkerSequence(
+            rig, markers, image_settings, options.marker_images, options.seed
+        )
         write_marker_radiographs(directory, sequence, progress)
     # Each part has its own seed, so that its size does not affect the others.
     if options.test_exposures:

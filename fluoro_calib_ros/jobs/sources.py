@@ -71,12 +71,14 @@ class Recording:
     radiographs: Mapping[str, Mapping[int, bytes]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        counts = ', '.join(f'{name}: {len(own)} frames' for name, own in self.frames.items())
+        counts = ', '.join(f'{name}: {len(frames)} frames' for name, frames in self.frames.items())
         return f'<Recording {counts or "empty"}>'
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return the observations as a pandas DataFrame. Raises DataError without pandas."""
-        frames = [frame for own in self.frames.values() for frame in own]
+        frames = [
+            frame for fluoroscope_frames in self.frames.values() for frame in fluoroscope_frames
+        ]
         return observation_table(frames, self.names).to_dataframe()
 
 
@@ -108,21 +110,21 @@ class BagSelection:
 
     def frames(self, path: object, found: Frames) -> dict[str, list[Frame]]:
         """Return the frames in the time window. Raises DataError if a fluoroscope has none."""
-        origin = min(frame.stamp_ns for each in found.values() for frame in each)
+        origin = min(frame.stamp_ns for frames in found.values() for frame in frames)
         low = -math.inf if self.start_s is None else self.start_s
         high = math.inf if self.end_s is None else self.end_s
-        kept = {
-            name: [frame for frame in each if low <= (frame.stamp_ns - origin) * 1e-9 <= high]
-            for name, each in found.items()
+        selected = {
+            name: [frame for frame in frames if low <= (frame.stamp_ns - origin) * 1e-9 <= high]
+            for name, frames in found.items()
         }
-        for name, each in kept.items():
-            if not each:
+        for name, frames in selected.items():
+            if not frames:
                 last = max(frame.stamp_ns for frame in found[name])
                 raise DataError(
                     f'{path}: there is no frame of fluoroscope {name} in the time window, its '
                     f'last frame is at {(last - origin) * 1e-9:.3f} s'
                 )
-        return kept
+        return selected
 
 
 @dataclass(frozen=True)
@@ -142,13 +144,13 @@ def read_content(path: PathLike, settings: FileSettings, part: str, default: str
     default: kind of a CSV file that is not recognised, whose reader then reports what is wrong.
     Raises DataError for a format without this part.
     """
-    found = registry.recognised(path)
-    kind = None if found else default if Path(path).suffix.lower() == '.csv' else None
-    if found and part not in found.parts:
-        has = ' and '.join(PARTS[name] for name in found.parts)
+    format_ = registry.recognised(path)
+    kind = None if format_ else default if Path(path).suffix.lower() == '.csv' else None
+    if format_ and part not in format_.parts:
+        parts = ' and '.join(PARTS[name] for name in format_.parts)
         needed = f'{PARTS[part]} {"is" if part == "survey" else "are"} needed'
         raise DataError(
-            f'this looks like {found.title} ({found.kind}), which has {has}, but {needed}',
+            f'this looks like {format_.title} ({format_.kind}), which has {parts}, but {needed}',
             at=path,
             kind=Kind.WRONG_FORMAT,
         )
@@ -176,13 +178,13 @@ def read_orientations(
     out: dict[str, KnownOrientation] = {}
     for path in paths:
         if holds_known_orientations(path):
-            found = read_known_orientations(path)
+            orientations = read_known_orientations(path)
         else:
-            found = _orientations_of_cameras(path, settings or FileSettings())
-        for name in found:
+            orientations = _orientations_of_cameras(path, settings or FileSettings())
+        for name in orientations:
             if name in out:
                 raise DataError(f'{path}: the orientation of fluoroscope {name} is already given')
-        out |= found
+        out |= orientations
     return out
 
 
@@ -240,19 +242,21 @@ def read_source(
     bag = Path(path).is_dir() or is_bag(path)  # the reader refuses a folder that is no bag
     if bag:
         contents = read_frames(path, validate)
-        found = selection.frames(path, contents.frames)
-        found, notes = with_angles(path, found, selection.angles)
+        observations = selection.frames(path, contents.frames)
+        observations, notes = with_angles(path, observations, selection.angles)
         content = Content(notes=(*contents.notes, *notes))
     else:
         selection.check_file(path)
         settings = replace(settings, image_size=image_size, fluoroscopes=tuple(fluoroscopes or ()))
-        found, content = _observed(path, settings)
+        observations, content = _observed(path, settings)
     names = settings.names.merged(content.names)
-    wanted = list(found) if fluoroscopes is None else list(fluoroscopes)
-    for name in wanted:
-        if name not in found:
-            raise DataError(f'{path}: there is no fluoroscope {name!r}, only {", ".join(found)}')
-    frames = {name: found[name] for name in wanted}
+    selected = list(observations) if fluoroscopes is None else list(fluoroscopes)
+    for name in selected:
+        if name not in observations:
+            raise DataError(
+                f'{path}: there is no fluoroscope {name!r}, only {", ".join(observations)}'
+            )
+    frames = {name: observations[name] for name in selected}
     if not bag or (collect is None and selection.pair_by == 'frame_number'):
         return with_decisions(Recording(frames, {}, names, content.notes), settings.decisions)
     notes = content.notes
@@ -282,10 +286,10 @@ def _observed(path: PathLike, settings: FileSettings) -> tuple[dict[str, list[Fr
     """Read the frames of a file, and its other content. Raises DataError."""
     content = read_content(path, settings, 'observations', 'observations')
     require_observed(path, content.corrected_by)
-    found = {name: list(frames) for name, frames in (content.observations or {}).items()}
-    if not found:
+    observations = {name: list(frames) for name, frames in (content.observations or {}).items()}
+    if not observations:
         raise DataError(f'{path}: the file has no image points')
-    return found, content
+    return observations, content
 
 
 def select_calibrations(
@@ -321,10 +325,12 @@ def read_calibrations(
 
     Raises DataError for a folder without calibrations, a missing calibration, and a damaged file.
     """
-    found = load_calibrations(directory)
-    if not found:
+    calibrations = load_calibrations(directory)
+    if not calibrations:
         raise DataError(f'{directory}: there is no calibration in this folder')
-    return select_calibrations(found, found if fluoroscopes is None else fluoroscopes, directory)
+    return select_calibrations(
+        calibrations, calibrations if fluoroscopes is None else fluoroscopes, directory
+    )
 
 
 def require_observed(path: object, corrected_by: Mapping[str, str]) -> None:
@@ -383,17 +389,19 @@ def read_calibrated_source(
         selection=selection,
     )
     select_calibrations(calibrations, recording.frames, directory)
-    unknown = _unknown_angles(path, recording.frames, calibrations, selection)
-    mixed = sentences(disagreements(directory, calibrations))
-    return replace(recording, notes=(*recording.notes, *unknown, *mixed)), calibrations
+    angle_notes = _unknown_angles(path, recording.frames, calibrations, selection)
+    disagreement_notes = sentences(disagreements(directory, calibrations))
+    return replace(
+        recording, notes=(*recording.notes, *angle_notes, *disagreement_notes)
+    ), calibrations
 
 
 def _unknown_angles(
     path: PathLike, frames: Frames, calibrations: Calibrations, selection: BagSelection | None
 ) -> Iterable[str]:
     """Yield a note for each fluoroscope whose correction needs angles that are unknown."""
-    for name, each in frames.items():
-        angles = [frame.angle for frame in each]
+    for name, fluoroscope_frames in frames.items():
+        angles = [frame.angle for frame in fluoroscope_frames]
         note = note_on_angles(name, calibrations[name].angle_field, angles)
         if not note:
             continue
@@ -414,9 +422,13 @@ def read_point_table(
     converted to one row per point. Raises DataError.
     """
     names = read_names(directory)
-    found = registry.recognised(path)
-    if found is None or found.kind == 'observations' or 'observations' not in found.parts:
+    recognised = registry.recognised(path)
+    if (
+        recognised is None
+        or recognised.kind == 'observations'
+        or 'observations' not in recognised.parts
+    ):
         return read_points(path, names.fluoroscopes), ()
-    content = read_content(path, replace(settings, names=names), 'observations', found.kind)
+    content = read_content(path, replace(settings, names=names), 'observations', recognised.kind)
     points = points_of_frames(path, content.observations or {}, names.merged(content.names))
     return points, content.notes

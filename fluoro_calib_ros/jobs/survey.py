@@ -132,35 +132,35 @@ def survey(
             kind=Kind.UNDETERMINED,
             advice='turn and move the phantom more between the exposures',
         )
-    found = surveyed_beads(result, request.given, request.distances)
-    left_out = unsurveyed(found)
-    lacking = {target for one in left_out for target in one.place.target_id}
-    beads = found.without(lacking)
-    checks = check_survey(found)
+    surveyed = surveyed_beads(result, request.given, request.distances)
+    left_out = unsurveyed(surveyed)
+    unsurveyed_ids = {target for finding in left_out for target in finding.place.target_id}
+    beads = surveyed.without(unsurveyed_ids)
+    checks = check_survey(surveyed)
     if len(beads.target_id) < MIN_TARGETS:
         raise DataError(
             f'only {len(beads.target_id)} beads can be surveyed',
-            *(replace(one, severity=Severity.ERROR) for one in left_out),
+            *(replace(finding, severity=Severity.ERROR) for finding in left_out),
             kind=Kind.FEW_TARGETS,
         )
     checks.append(_halves(request, result))
-    moved = displaced(beads)
+    displacement = displaced(beads)
     return SurveyOutcome(
         _phantom(request, beads),
         beads,
         Validation(verdict_of(checks), tuple(checks), {}, time.perf_counter() - began),
-        (*result.findings, *left_out, *([] if moved is None else [moved])),
+        (*result.findings, *left_out, *([] if displacement is None else [displacement])),
         result,
     )
 
 
 def _require_known(request: SurveyRequest) -> None:
     """Raise DataError for a distance to a bead that the phantom does not have."""
-    for one in request.distances:
-        for end in (one.first, one.second):
-            if request.given.index([end])[0] < 0:
+    for distance in request.distances:
+        for bead in (distance.first, distance.second):
+            if request.given.index([bead])[0] < 0:
                 raise DataError(
-                    f'{one.name}: bead {end} is not on the phantom', kind=Kind.NOT_IN_BOTH
+                    f'{distance.name}: bead {bead} is not on the phantom', kind=Kind.NOT_IN_BOTH
                 )
 
 
@@ -184,7 +184,7 @@ def _free_network(
         return adjusted(request.given, force=False)
     except DataError as error:
         # Exposures that do not fit the given coordinates may fit those found from the images.
-        if any(found.kind is not Kind.OTHER_PHANTOM for found in error.findings):
+        if any(finding.kind is not Kind.OTHER_PHANTOM for finding in error.findings):
             raise
         refused = error
     try:
@@ -206,8 +206,10 @@ def _halves(
     result: CalibrationResult,
 ) -> Check:
     """Compare two surveys, each from every second exposure."""
-    numbers = sorted({e.exposure for one in result.fluoroscopes.values() for e in one.exposures})
-    fewest = min(len(one.exposures) for one in result.fluoroscopes.values())
+    numbers = sorted(
+        {e.exposure for fluoroscope in result.fluoroscopes.values() for e in fluoroscope.exposures}
+    )
+    fewest = min(len(fluoroscope.exposures) for fluoroscope in result.fluoroscopes.values())
     if fewest < 2 * MIN_EXPOSURES:
         return halves_not_compared(
             f'{fewest} exposures are too few for two halves of {MIN_EXPOSURES} or more'
@@ -217,35 +219,37 @@ def _halves(
     start = replace(
         _with_found(request.given, result), sd_mm=np.full(len(request.given.sd_mm), EXACT_SD_MM)
     )
-    parts = []
+    surveys = []
     for half in (set(numbers[::2]), set(numbers[1::2])):
         frames = {
             name: [frame for frame in exposures if frame.number in half]
             for name, exposures in request.frames.items()
         }
         try:
-            part = calibrate_request(request.calibration_of(frames, start), None)
+            half_result = calibrate_request(request.calibration_of(frames, start), None)
         except (DataError, np.linalg.LinAlgError) as error:
             return halves_not_compared(f'half of the exposures cannot be adjusted ({error})')
-        beads = surveyed_beads(part, start)
-        lacking = {target for one in unsurveyed(beads) for target in one.place.target_id}
-        parts.append(beads.without(lacking))
-    return check_survey_halves(*parts)
+        beads = surveyed_beads(half_result, start)
+        unsurveyed_ids = {
+            target for finding in unsurveyed(beads) for target in finding.place.target_id
+        }
+        surveys.append(beads.without(unsurveyed_ids))
+    return check_survey_halves(*surveys)
 
 
 def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:
     """Return the phantom with the surveyed coordinates."""
     given = request.given
     row = given.index(beads.target_id)
-    found_mm = np.round(beads.xyz_mm, 6)
-    found_sd = np.maximum(np.round(beads.sd_mm, 6), EXACT_SD_MM)
+    surveyed_mm = np.round(beads.xyz_mm, 6)
+    surveyed_sd = np.maximum(np.round(beads.sd_mm, 6), EXACT_SD_MM)
     if not request.keep_given:
         diameter = None if given.diameter_mm is None else given.diameter_mm[row]
-        return Phantom(beads.target_id, found_mm, found_sd, diameter)
+        return Phantom(beads.target_id, surveyed_mm, surveyed_sd, diameter)
     # Assume given coordinates as far off as those of surveyed beads were, if not more by their sd.
-    off = float(np.sqrt(np.mean(beads.off_mm**2) / 3))
+    deviation_mm = float(np.sqrt(np.mean(beads.off_mm**2) / 3))
     xyz = given.xyz_mm.copy()
-    sd = np.maximum(given.sd_mm, off)
-    xyz[row] = found_mm
-    sd[row] = found_sd
+    sd = np.maximum(given.sd_mm, deviation_mm)
+    xyz[row] = surveyed_mm
+    sd[row] = surveyed_sd
     return replace(given, xyz_mm=xyz, sd_mm=sd)

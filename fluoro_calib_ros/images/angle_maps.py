@@ -119,8 +119,8 @@ class _Base:
         self._longest_step = float(max(np.abs(right).max(), np.abs(down).max()))
         # A source is interpolated between four pixels, none of which may be bad.
         self._bad = cv2.dilate(bad, np.ones((3, 3), np.uint8)) if bad.any() else None
-        own = slice(margin, -margin)
-        self._source = np.ascontiguousarray(source[:, own, own])
+        image_part = slice(margin, -margin)
+        self._source = np.ascontiguousarray(source[:, image_part, image_part])
         self._high = np.array(self._size, dtype=np.float32)[:, None, None] - np.float32(0.5)
         self._inner = [self._far_from_rim(start) for start in range(0, self._size[1], STRIPE)]
         pixels = np.moveaxis(np.indices((height, width))[::-1], 0, 2).astype(np.float32)
@@ -132,10 +132,10 @@ class _Base:
 
     def _far_from_rim(self, start: int) -> slice:
         """Return the columns of a stripe whose sources are in the image at all angles."""
-        own = self._source[:, start : start + STRIPE]
-        near = (own < self.margin - 0.5) | (own >= self._high - self.margin)
+        sources = self._source[:, start : start + STRIPE]
+        near_rim = (sources < self.margin - 0.5) | (sources >= self._high - self.margin)
         width = self._size[0]
-        columns = np.flatnonzero(near.reshape(-1, width).any(axis=0))
+        columns = np.flatnonzero(near_rim.reshape(-1, width).any(axis=0))
         left, right = columns[columns < width // 2], columns[columns >= width // 2]
         return slice(left.max(initial=-1) + 1, right.min(initial=width))
 
@@ -152,8 +152,8 @@ class _Base:
             cv2.add(of_mean, self._between(of_nodes, start), dst=out)
         inner = self._inner[start // STRIPE] if is_small else slice(0, 0)
         for columns in (slice(0, inner.start), slice(inner.stop, None)):
-            own = source[:, :, columns]
-            own[:, ~((own >= -0.5) & (own < self._high)).all(axis=0)] = np.nan
+            block = source[:, :, columns]
+            block[:, ~((block >= -0.5) & (block < self._high)).all(axis=0)] = np.nan
         return source
 
     def _between(self, of_nodes: NDArray[np.float32], start: int) -> NDArray[np.float32]:
@@ -163,16 +163,18 @@ class _Base:
         """
         width, height = self._size
         count = min(STRIPE, height - start)
-        own = of_nodes[start // NODE_PX : -(-(start + count) // NODE_PX) + 2]
-        fine = cv2.resize(own, (own.shape[1] * NODE_PX, own.shape[0] * NODE_PX))
+        stripe_nodes = of_nodes[start // NODE_PX : -(-(start + count) // NODE_PX) + 2]
+        fine = cv2.resize(
+            stripe_nodes, (stripe_nodes.shape[1] * NODE_PX, stripe_nodes.shape[0] * NODE_PX)
+        )
         return fine[NODE_PX : NODE_PX + count, NODE_PX : NODE_PX + width]
 
     def status(self, source: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return the status (h, w) of the observed pixels at sources (2, h, w)."""
-        found = [
+        row_status = [
             self._grid.look_up(*source[:, row].astype(float))[1] for row in range(source.shape[1])
         ]
-        return np.stack(found)
+        return np.stack(row_status)
 
     def may_fold(self, shift: NDArray[np.float32]) -> bool:
         """Return whether sources shifted by (2, rows, columns) may show pixels mirrored."""

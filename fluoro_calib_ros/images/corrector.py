@@ -195,7 +195,7 @@ class ImageCorrector:
     def _remap_cubic(self, image: np.ndarray, out: np.ndarray) -> None:
         """Remap with the two pixels needed beyond the border equal to the outermost pixels."""
         narrow = image.dtype == np.uint8  # OpenCV is three times as fast with 16 bits
-        wide = cv2.remap(
+        remapped = cv2.remap(
             image.astype(np.uint16) if narrow else image,
             self._map_1,
             self._map_2,
@@ -204,7 +204,7 @@ class ImageCorrector:
             borderMode=cv2.BORDER_REPLICATE,
         )
         if narrow:
-            np.minimum(wide, 255, out=out, casting='unsafe')
+            np.minimum(remapped, 255, out=out, casting='unsafe')
         out.ravel()[self._empty] = self.border
 
 
@@ -253,9 +253,9 @@ def iterated(
     observed = undistorted.copy()
     active = np.arange(undistorted.shape[1])
     for number in range(FULL_STEPS + HALF_STEPS):
-        at = observed[:, active]
-        step = undistorted[:, active] + look_up(grid, at) - at
-        observed[:, active] = at + (step if number < FULL_STEPS else step / 2)
+        position = observed[:, active]
+        step = undistorted[:, active] + look_up(grid, position) - position
+        observed[:, active] = position + (step if number < FULL_STEPS else step / 2)
         active = active[np.abs(step).max(axis=0) > STEP_PX]
         if not len(active):
             break
@@ -270,9 +270,9 @@ def as_at_rim(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float
 def continued(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return corrections (2, n) at pixels (2, n), extrapolated with the slope at the border."""
     out = as_at_rim(grid, at)
-    off = np.flatnonzero(((at < -0.5) | (at > _end(grid))).any(axis=0))
-    mirrored = 2 * np.clip(at[:, off], -0.5, _end(grid)) - at[:, off]
-    out[:, off] = 2 * out[:, off] - as_at_rim(grid, mirrored)
+    outside = np.flatnonzero(((at < -0.5) | (at > _end(grid))).any(axis=0))
+    mirrored = 2 * np.clip(at[:, outside], -0.5, _end(grid)) - at[:, outside]
+    out[:, outside] = 2 * out[:, outside] - as_at_rim(grid, mirrored)
     return out
 
 
@@ -301,11 +301,11 @@ def _cubic_coordinates(wanted: NDArray[np.float32]) -> NDArray[np.float32]:
     """
     a = SHARPNESS
     x = np.linspace(0, 1, 1025)
-    near = [((a + 2) * d - (a + 3)) * d * d + 1 for d in (x, 1 - x)]
-    far = [((a * d - 5 * a) * d + 8 * a) * d - 4 * a for d in (1 + x, 2 - x)]
-    moment = near[1] + 2 * far[1] - far[0]
-    whole = np.floor(wanted)
-    return (whole + np.interp(wanted - whole, moment, x)).astype(np.float32)
+    near_weight = [((a + 2) * d - (a + 3)) * d * d + 1 for d in (x, 1 - x)]
+    far_weight = [((a * d - 5 * a) * d + 8 * a) * d - 4 * a for d in (1 + x, 2 - x)]
+    moment = near_weight[1] + 2 * far_weight[1] - far_weight[0]
+    pixel = np.floor(wanted)
+    return (pixel + np.interp(wanted - pixel, moment, x)).astype(np.float32)
 
 
 def _size_text(size: Sequence[int]) -> str:

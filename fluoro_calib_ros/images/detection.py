@@ -100,10 +100,10 @@ def detect_beads(
         return next(likely_detections(image, beads))
     sight = _Sight.of(image, beads, look.noise)
     scale = max(look.radius_px / BLOB_RADIUS, 1.0)
-    found = sight.detections(scale, look.inverted, look.radius_px if look.alike else None)
-    if found is None:
+    detections = sight.detections(scale, look.inverted, look.radius_px if look.alike else None)
+    if detections is None:
         raise _nothing(image, sight)
-    return found
+    return detections
 
 
 def likely_detections(image: np.ndarray, beads: int) -> Iterator[Detections]:
@@ -114,16 +114,16 @@ def likely_detections(image: np.ndarray, beads: int) -> Iterator[Detections]:
     """
     sight = _Sight.of(image, beads)
     # If an image shows fewer beads than expected, the strongest blob determines their size.
-    for part in (sight, replace(sight, typical=1)):
-        number = 0
-        for scale, inverted in part.looks(whole=beads < MANY):
-            found = part.detections(scale, inverted)
-            if found is not None:
-                number += 1
-                yield found
-            if number == MAX_LIKELY:
+    for trial in (sight, replace(sight, typical=1)):
+        count = 0
+        for scale, inverted in trial.looks(whole=beads < MANY):
+            detections = trial.detections(scale, inverted)
+            if detections is not None:
+                count += 1
+                yield detections
+            if count == MAX_LIKELY:
                 return
-        if number:
+        if count:
             return
     raise _nothing(image, sight)
 
@@ -166,11 +166,11 @@ class _Sight:
         fields: dict[int, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}
         for column, (scale, part, factor) in enumerate(_resolutions(grey), 1):
             if factor not in fields:
-                turned = float(part.max()) - part
+                negative = float(part.max()) - part
                 lit = field_of_view(part, FINE_SCALE)
-                fields[factor] = lit, lit & field_of_view(turned, FINE_SCALE)
-            both = _blobs(part, self.noise, scale / factor, factor)
-            for row, blobs in enumerate(both):
+                fields[factor] = lit, lit & field_of_view(negative, FINE_SCALE)
+            blobs_of_polarities = _blobs(part, self.noise, scale / factor, factor)
+            for row, blobs in enumerate(blobs_of_polarities):
                 inside = _inside(blobs.uv, fields[factor][row], factor)
                 strengths[row, column] = _typical(blobs.response[inside], self.typical)
         middle = strengths[:, 1:-1]
@@ -204,10 +204,10 @@ class _Sight:
                 (width, height),
                 interpolation=cv2.INTER_AREA,
             )
-            wide = larger * scale
-            found = _blobs(part, self.noise, wide / factor, factor, (inverted,))[0]
-            near = tree.query_ball_point(found.uv, BLOB_RADIUS * wide)
-            for place, relative, rows in zip(found.uv, found.relative, near):
+            wide_scale = larger * scale
+            larger_blobs = _blobs(part, self.noise, wide_scale / factor, factor, (inverted,))[0]
+            nearby = tree.query_ball_point(larger_blobs.uv, BLOB_RADIUS * wide_scale)
+            for place, relative, rows in zip(larger_blobs.uv, larger_blobs.relative, nearby):
                 inside = [row for row in rows if not merged[row]]
                 if len(inside) > 1 and relative > blobs.relative[inside].max():
                     merged[inside] = True
@@ -262,8 +262,8 @@ class _Sight:
 def field_of_view(light: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:
     """Return the mask (h, w) of the field of view: where there is light, with holes filled."""
     smooth = cv2.GaussianBlur(light, (0, 0), max(FIELD_BLUR_PX, 2 * scale))
-    apart = int(FIELD_BLUR_PX)  # pixels across which the blurred image hardly changes
-    low, high = map(float, np.percentile(smooth[::apart, ::apart], [1, 95]))
+    stride = int(FIELD_BLUR_PX)  # pixels across which the blurred image hardly changes
+    low, high = map(float, np.percentile(smooth[::stride, ::stride], [1, 95]))
     mask = (smooth > low + FIELD_LEVEL * (high - low)).astype(np.uint8)
     if mask.mean() > 0.98 or low > 0.35 * high:
         return np.ones(light.shape, dtype=bool)
@@ -459,18 +459,18 @@ def _curvatures(
     A few rows are processed at a time, so that intermediate results stay in the cache of a core.
     """
     smooth = cv2.GaussianBlur(grey, (0, 0), scale)
-    twice = np.array([1.0, -2.0, 1.0], dtype=np.float32)
-    one = np.array([0.0, 1.0, 0.0], dtype=np.float32)
-    once = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
+    second_difference = np.array([1.0, -2.0, 1.0], dtype=np.float32)
+    identity = np.array([0.0, 1.0, 0.0], dtype=np.float32)
+    first_difference = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
     step = max(PIXELS_AT_ONCE // grey.shape[1], 1)
     for first in range(0, len(grey), step):
         last = min(first + step, len(grey))
         above = max(first - 1, 0)
-        part = smooth[above : last + 1]
-        own = slice(first - above, last - above)
-        xx = cv2.sepFilter2D(part, cv2.CV_32F, twice, one)[own]
-        yy = cv2.sepFilter2D(part, cv2.CV_32F, one, twice)[own]
-        xy = cv2.sepFilter2D(part, cv2.CV_32F, once, once)[own]
+        strip = smooth[above : last + 1]
+        inner = slice(first - above, last - above)
+        xx = cv2.sepFilter2D(strip, cv2.CV_32F, second_difference, identity)[inner]
+        yy = cv2.sepFilter2D(strip, cv2.CV_32F, identity, second_difference)[inner]
+        xy = cv2.sepFilter2D(strip, cv2.CV_32F, first_difference, first_difference)[inner]
         mean = (0.5 * scale**2) * (xx + yy)
         xx -= yy
         xx *= 0.5

@@ -51,10 +51,10 @@ def set_apart(
     discs = discs[~_in_bars(discs, distance, part, radius)]
     if not len(discs):
         return uv, None
-    away, nearest = cKDTree(discs).query(uv)
-    exact = away < SAME * radius
-    found = np.isin(np.arange(len(discs)), nearest[exact])
-    return np.concatenate([uv[exact | (away > radius)], discs[~found]]), radius
+    disc_distance, nearest = cKDTree(discs).query(uv)
+    exact = disc_distance < SAME * radius
+    has_blob = np.isin(np.arange(len(discs)), nearest[exact])
+    return np.concatenate([uv[exact | (disc_distance > radius)], discs[~has_blob]]), radius
 
 
 def _discs(distance: NDArray[np.float32], radius: float) -> NDArray[np.float64]:
@@ -64,8 +64,8 @@ def _discs(distance: NDArray[np.float32], radius: float) -> NDArray[np.float64]:
     v, u = np.nonzero((distance >= cv2.dilate(distance, kernel)) & (distance > SIZES[0] * radius))
     place = np.column_stack([u, v]).astype(float)
     place = place[np.argsort(-distance[v, u], kind='stable')]
-    again = {two for _, two in cKDTree(place).query_pairs(APART * radius)}
-    return place[[number for number in range(len(place)) if number not in again]]
+    duplicates = {second for _, second in cKDTree(place).query_pairs(APART * radius)}
+    return place[[number for number in range(len(place)) if number not in duplicates]]
 
 
 def _in_bars(
@@ -80,12 +80,12 @@ def _in_bars(
     it is not. Three beads in a line form one such pair; a bar has at least MIN_STRAIGHT pairs.
     """
     pair = cKDTree(discs).query_pairs(2 * radius, output_type='ndarray').reshape(-1, 2)
-    away = np.linalg.norm(discs[pair[:, 0]] - discs[pair[:, 1]], axis=1)
-    pair, away = pair[away > radius], away[away > radius]
+    spacing = np.linalg.norm(discs[pair[:, 0]] - discs[pair[:, 1]], axis=1)
+    pair, spacing = pair[spacing > radius], spacing[spacing > radius]
     label = part[tuple(discs.astype(int).T[::-1])]
     column, row = np.rint(discs[pair].mean(axis=1)).astype(int).T
-    between = np.sqrt(np.maximum(radius**2 - away**2 / 4, 0))
-    straight = distance[row, column] > 0.5 * (radius + between)
+    half_width = np.sqrt(np.maximum(radius**2 - spacing**2 / 4, 0))
+    straight = distance[row, column] > 0.5 * (radius + half_width)
     size = int(part.max()) + 1
     count = np.bincount(label[pair[straight, 0]], minlength=size)
     total = np.bincount(label[pair[:, 0]], minlength=size)

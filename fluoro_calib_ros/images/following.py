@@ -53,15 +53,15 @@ def follow(
     expected = settle(near, model.xyz, seen)
     if _fits(expected, limit):
         return expected
-    for found in _elsewhere(seen, model, near, far):
-        if found is None or not _fits(found, limit):
+    for match in _elsewhere(seen, model, near, far):
+        if match is None or not _fits(match, limit):
             continue
         try:
             # A grid may have moved by a step of its pattern.
-            found = unambiguous(found, seen, model, FAR_TURN_RAD)
+            match = unambiguous(match, seen, model, FAR_TURN_RAD)
         except DataError:
             return None
-        return found if _fits(found, limit) else None
+        return match if _fits(match, limit) else None
     return None
 
 
@@ -114,8 +114,8 @@ def _over_the_image(seen: Seen, xyz: NDArray[np.float64], near: View) -> Match |
     if shift is None:
         return None
     view = _shifted(near, shift, float(np.median(near.depth(xyz))))
-    from_middle = np.linalg.norm(predicted[row] - predicted[row].mean(axis=0), axis=1)
-    return grow(view, int(row[np.argmin(from_middle)]), xyz, seen)
+    middle_distance = np.linalg.norm(predicted[row] - predicted[row].mean(axis=0), axis=1)
+    return grow(view, int(row[np.argmin(middle_distance)]), xyz, seen)
 
 
 def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | None]:
@@ -133,11 +133,11 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
     reach = FAR_REACH * max(seen.field.shape)
     for seed in seeds_of(seen)[:FAR_SEEDS]:
         with np.errstate(invalid='ignore'):
-            close = np.linalg.norm(predicted - seen.uv[seed], axis=1) < reach
-        triples = model.triples.of_beads(close)
+            is_close = np.linalg.norm(predicted - seen.uv[seed], axis=1) < reach
+        triples = model.triples.of_beads(is_close)
         poses = local_poses(seed, seen.uv, NEIGHBOURS[1], triples, beads, scales=scales)
-        turned = [_turned(pose, near, model.xyz) for pose in poses]
-        started = [(pose, view) for pose, view in zip(poses, turned) if view is not None]
+        views = [_turned(pose, near, model.xyz) for pose in poses]
+        started = [(pose, view) for pose, view in zip(poses, views) if view is not None]
         for pose, view in started[:FAR_POSES]:
             yield grow(view, pose.bead, model.xyz, seen)
 
@@ -165,7 +165,12 @@ def _shift(predicted: NDArray[np.float64], seen: Seen) -> NDArray[np.float64] | 
     reach = REACH * max(seen.field.shape)
     pairs = cKDTree(predicted).query_ball_tree(seen.tree, reach)
     steps = np.concatenate(
-        [seen.uv[near] - at for at, near in zip(predicted, pairs) if near] or [np.zeros((0, 2))]
+        [
+            seen.uv[detections] - prediction
+            for prediction, detections in zip(predicted, pairs)
+            if detections
+        ]
+        or [np.zeros((0, 2))]
     )
     if not len(steps):
         return None

@@ -192,8 +192,8 @@ def pairs(
     row = np.flatnonzero(np.isfinite(distance))
     order = row[np.argsort(distance[row], kind='stable')]
     _, first = np.unique(detection[order], return_index=True)
-    kept = np.sort(order[first])
-    return kept, detection[kept]
+    matched = np.sort(order[first])
+    return matched, detection[matched]
 
 
 def nearby_residuals(
@@ -219,28 +219,30 @@ def _judged(
     is_found = np.zeros(len(row), dtype=bool)
     is_found[bead] = True
     # Two beads that overlap are detected as one, somewhere between them.
-    merged, _ = seen.tree.query(predicted[row], distance_upper_bound=1.2 * seen.radius_px)
-    other = cKDTree(predicted[row]).query(predicted[row], k=[2])[0][:, 0]
-    is_found |= np.isfinite(merged) & (other < 2 * seen.radius_px)
-    near, _ = cKDTree(predicted[row]).query(
+    detection_distance, _ = seen.tree.query(
+        predicted[row], distance_upper_bound=1.2 * seen.radius_px
+    )
+    spacing = cKDTree(predicted[row]).query(predicted[row], k=[2])[0][:, 0]
+    is_found |= np.isfinite(detection_distance) & (spacing < 2 * seen.radius_px)
+    prediction_distance, _ = cKDTree(predicted[row]).query(
         seen.uv, distance_upper_bound=max(tolerance, 1.2 * seen.radius_px)
     )
     good = _good_cells(predicted[row], is_found, seen.field.shape)
     # A detection between two predictions may belong to either.
     tree = cKDTree(predicted[row])
     distance, _ = tree.query(seen.uv[detection], k=2)
-    sure = distance[:, 1] > distance[:, 0] + AMBIGUOUS_PX
+    is_unique = distance[:, 1] > distance[:, 0] + AMBIGUOUS_PX
     matched = np.zeros(len(row), dtype=bool)
-    matched[bead[sure]] = True
+    matched[bead[is_unique]] = True
     good &= supported(xyz[row], matched)
-    kept = good[bead] & sure
+    accepted = good[bead] & is_unique
     return Match(
         view,
-        row[bead[kept]],
-        detection=detection[kept],
+        row[bead[accepted]],
+        detection=detection[accepted],
         predicted=predicted,
         found=float(np.mean(is_found)),
-        explained=float(np.mean(np.isfinite(near))),
+        explained=float(np.mean(np.isfinite(prediction_distance))),
         scale_px=scale,
         expected=len(row),
     )
@@ -255,8 +257,8 @@ def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.b
     count = min(SUPPORT + 1, len(xyz))
     _, near = cKDTree(xyz).query(xyz, k=count)
     near = near.reshape(len(xyz), -1)
-    other = near != np.arange(len(xyz))[:, None]
-    share = np.sum(good[near] & other, axis=1) / np.maximum(other.sum(axis=1), 1)
+    is_other = near != np.arange(len(xyz))[:, None]
+    share = np.sum(good[near] & is_other, axis=1) / np.maximum(is_other.sum(axis=1), 1)
     return np.asarray(share >= MIN_SHARE)
 
 
@@ -269,8 +271,8 @@ def _good_cells(
     number = cell[:, 0] * CELLS + cell[:, 1]
     total = np.bincount(number, minlength=CELLS * CELLS)
     hits = np.bincount(number, weights=found, minlength=CELLS * CELLS)
-    bad = (total >= MIN_CELL) & (hits < 0.6 * total)
-    return ~bad[number]
+    bad_cell = (total >= MIN_CELL) & (hits < 0.6 * total)
+    return ~bad_cell[number]
 
 
 # Interpolation of the residuals of matched beads over an image.
@@ -350,12 +352,12 @@ class _Kriging:
         """Return the system of places (n, 2) in units of the length of the covariance."""
         count = min(NEIGHBOURS + 1, len(bead))
         _, near = cKDTree(place[bead]).query(place, k=list(range(1, count + 1)))
-        other = bead[near] != np.arange(len(place))[:, None]
+        is_other = bead[near] != np.arange(len(place))[:, None]
         neighbour = place[bead[near]]
-        known = _matern(neighbour - place[:, None]) * other
+        known = _matern(neighbour - place[:, None]) * is_other
         covariance = _matern(neighbour[:, :, None] - neighbour[:, None])
         # A bead's own residual is uncorrelated with all others, so that it gets no weight.
-        covariance *= other[:, :, None] & other[:, None] | np.eye(count, dtype=bool)
+        covariance *= is_other[:, :, None] & is_other[:, None] | np.eye(count, dtype=bool)
         return cls(near, covariance, known)
 
     def chosen(self, rows: NDArray[np.int64]) -> _Kriging:

@@ -82,8 +82,8 @@ def number_lattice(points: NDArray[np.float64]) -> Lattice | None:
     if len(points) < 9:
         return None
     tree = cKDTree(points)
-    middle = np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=1), kind='stable')
-    for start in middle[:CENTRAL]:
+    central = np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=1), kind='stable')
+    for start in central[:CENTRAL]:
         basis = _basis(points, tree, int(start))
         if basis is None:
             continue
@@ -130,7 +130,7 @@ def _numbered(
 ) -> dict[int, tuple[int, int]]:
     """Return the indices of points that can be reached step by step from a start."""
     number = {start: (0, 0)}
-    taken = {(0, 0)}
+    used = {(0, 0)}
     steps = {start: basis}
     waiting = deque([start])
     while waiting:
@@ -138,21 +138,21 @@ def _numbered(
         local = steps[point]
         reach = REACH * float(np.linalg.norm(local, axis=1).min())
         for axis, sign in product((0, 1), (1, -1)):
-            place = list(number[point])
-            place[axis] += sign
-            key = (place[0], place[1])
-            if key in taken:
+            index = list(number[point])
+            index[axis] += sign
+            key = (index[0], index[1])
+            if key in used:
                 continue
-            distance, other = tree.query(points[point] + sign * local[axis])
-            if distance > reach or other in number:
+            distance, neighbour = tree.query(points[point] + sign * local[axis])
+            if distance > reach or neighbour in number:
                 continue
-            taken.add(key)
-            number[other] = key
+            used.add(key)
+            number[neighbour] = key
             # Average the new step with the old: one misplaced bead does not turn the lattice.
-            bent = local.copy()
-            bent[axis] = 0.5 * (local[axis] + sign * (points[other] - points[point]))
-            steps[other] = bent
-            waiting.append(other)
+            new_steps = local.copy()
+            new_steps[axis] = 0.5 * (local[axis] + sign * (points[neighbour] - points[point]))
+            steps[neighbour] = new_steps
+            waiting.append(neighbour)
     return number
 
 
@@ -174,22 +174,26 @@ def grid_poses(
     Poses with equally many are in order of tilt, the least tilted first, then by how upright they
     are, then by the distance of their middle from that of the image.
     """
-    found = number_lattice(seen.uv)
-    if found is None:
+    detected = number_lattice(seen.uv)
+    if detected is None:
         return
-    missing = _missing(found.index)
-    middle = found.index[np.argmin(np.linalg.norm(seen.uv[found.row] - lens.centre, axis=1))]
-    image_steps = _steps(found.index, seen.uv[found.row])
+    missing = _missing(detected.index)
+    middle_index = detected.index[
+        np.argmin(np.linalg.norm(seen.uv[detected.row] - lens.centre, axis=1))
+    ]
+    image_steps = _steps(detected.index, seen.uv[detected.row])
     grid_steps = _steps(grid.lattice.index, (xyz[grid.lattice.row] - grid.centre) @ grid.axes.T)
-    in_middle = np.argmin(np.linalg.norm(xyz[grid.lattice.row] - grid.centre, axis=1))
-    target = grid.lattice.index[in_middle]
+    central = np.argmin(np.linalg.norm(xyz[grid.lattice.row] - grid.centre, axis=1))
+    target = grid.lattice.index[central]
     candidates = []
     for change in _changes():
         view = np.linalg.pinv(grid_steps) @ np.linalg.inv(change) @ image_steps
         long, short = np.linalg.svd(view, compute_uv=False)
         upright = (grid.axes.T @ view)[:2].trace() / (long + short)
-        turned = found.index @ change
-        shifts = _shifts(turned, missing @ change, grid.lattice.index, target - middle @ change)
+        turned = detected.index @ change
+        shifts = _shifts(
+            turned, missing @ change, grid.lattice.index, target - middle_index @ change
+        )
         for shift, against in shifts:
             key = (against, -round(short / long, 1), -round(upright, 1))
             candidates.append((key, change, shift))
@@ -197,16 +201,16 @@ def grid_poses(
     row_at = {tuple(place): row for place, row in zip(grid.lattice.index, grid.lattice.row)}
 
     def fit(change: NDArray[np.int64], shift: NDArray[np.int64]) -> Match | None:
-        places = found.index @ change + shift
+        places = detected.index @ change + shift
         bead = np.array([row_at.get((int(a), int(b)), -1) for a, b in places])
         known = bead >= 0
         if np.count_nonzero(known) < MIN_SHARE * len(known):
             return None
-        view = _view(grid, xyz[bead[known]], seen.uv[found.row[known]], lens)
+        view = _view(grid, xyz[bead[known]], seen.uv[detected.row[known]], lens)
         return None if view is None else settle(view, xyz, seen)
 
     for (against, *_), change, shift in candidates:
-        yield GridPose(against, len(found.index), partial(fit, change, shift))
+        yield GridPose(against, len(detected.index), partial(fit, change, shift))
 
 
 def _steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> np.ndarray:
@@ -218,10 +222,10 @@ def _steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> np.ndarray:
 def _missing(index: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return indices (k, 2) of a lattice without a detection but with detections all around."""
     corner = index.min(axis=0) - 2 * GAP
-    there = np.pad(_raster(index - corner), ((0, 2 * GAP), (0, 2 * GAP))) > 0
-    around = binary_closing(there, np.ones((3, 3)), iterations=GAP)
-    around = binary_erosion(around, np.ones((3, 3)))
-    return np.argwhere(around & ~there) + corner
+    occupied = np.pad(_raster(index - corner), ((0, 2 * GAP), (0, 2 * GAP))) > 0
+    enclosed = binary_closing(occupied, np.ones((3, 3)), iterations=GAP)
+    enclosed = binary_erosion(enclosed, np.ones((3, 3)))
+    return np.argwhere(enclosed & ~occupied) + corner
 
 
 def _changes() -> Iterator[NDArray[np.int64]]:
@@ -242,20 +246,20 @@ def _shifts(
 
     Shifts with equally many are in order of their distance from a wanted shift (2,).
     """
-    corner = found.min(axis=0)
-    other = grid.min(axis=0)
-    there = _raster(grid - other)
-    here = _raster(found - corner)
-    gone = np.zeros_like(here)
-    gone[tuple((missing - corner).T)] = 1
-    shape = tuple(np.array(there.shape) + here.shape - 1)
+    found_corner = found.min(axis=0)
+    grid_corner = grid.min(axis=0)
+    grid_raster = _raster(grid - grid_corner)
+    found_raster = _raster(found - found_corner)
+    missing_raster = np.zeros_like(found_raster)
+    missing_raster[tuple((missing - found_corner).T)] = 1
+    shape = tuple(np.array(grid_raster.shape) + found_raster.shape - 1)
     # A detected bead counts for a shift, a missing bead against it.
-    both = np.fft.rfft2((here - gone)[::-1, ::-1], shape)
-    overlap = np.rint(np.fft.irfft2(np.fft.rfft2(there, shape) * both, shape)).astype(int)
-    start = other - corner - (np.array(here.shape) - 1)
+    kernel = np.fft.rfft2((found_raster - missing_raster)[::-1, ::-1], shape)
+    overlap = np.rint(np.fft.irfft2(np.fft.rfft2(grid_raster, shape) * kernel, shape)).astype(int)
+    start = grid_corner - found_corner - (np.array(found_raster.shape) - 1)
     i, j = np.indices(overlap.shape)
-    away = np.hypot(i + start[0] - wanted[0], j + start[1] - wanted[1])
-    best = np.lexsort((away.ravel(), -overlap.ravel()))[:SHIFTS]
+    distance = np.hypot(i + start[0] - wanted[0], j + start[1] - wanted[1])
+    best = np.lexsort((distance.ravel(), -overlap.ravel()))[:SHIFTS]
     return [
         (np.array(place) + start, len(found) - int(overlap[tuple(place)]))
         for place in np.column_stack(np.unravel_index(best, overlap.shape))

@@ -53,10 +53,10 @@ def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:
 
     With noise alone, the outermost value is rarer than its neighbour.
     """
-    least = float(grey.min())
-    most = float(grey.max())
-    low = least if _is_clipped(grey, least, least + 1) else -np.inf
-    high = most if _is_clipped(grey, most, most - 1) else np.inf
+    lowest = float(grey.min())
+    highest = float(grey.max())
+    low = lowest if _is_clipped(grey, lowest, lowest + 1) else -np.inf
+    high = highest if _is_clipped(grey, highest, highest - 1) else np.inf
     return low, high
 
 
@@ -95,11 +95,11 @@ def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
     if len(chosen) < MIN_PIXELS:
         return Noise(MIN_VARIANCE, 0.0, correlation)
     chosen = chosen[:: len(chosen) // SAMPLED + 1]
-    around = cv2.blur(light, (3, 3)).ravel()[chosen]
-    off = np.abs(cv2.filter2D(light, cv2.CV_32F, kernel).ravel()[chosen])
-    parts = np.array_split(np.argsort(around), LEVELS)
-    mean = np.array([np.median(around[part]) for part in parts])
-    variance = np.array([(1.4826 * np.median(off[part])) ** 2 for part in parts])
+    level = cv2.blur(light, (3, 3)).ravel()[chosen]
+    deviation = np.abs(cv2.filter2D(light, cv2.CV_32F, kernel).ravel()[chosen])
+    parts = np.array_split(np.argsort(level), LEVELS)
+    mean = np.array([np.median(level[part]) for part in parts])
+    variance = np.array([(1.4826 * np.median(deviation[part])) ** 2 for part in parts])
     variance = np.maximum(variance / _seen_by(SECOND, correlation), MIN_VARIANCE)
     weight = 1 / variance
     gain = constant = 0.0
@@ -114,9 +114,9 @@ def _seen_by(kernel: NDArray[np.float64], correlation: NDArray[np.float64]) -> f
     """Return the variance of noise after a kernel along both axes, over that of white noise."""
     lags = len(correlation) // 2
     padded = np.pad(kernel, lags)
-    own = np.array([padded @ np.roll(padded, lag) for lag in range(-lags, lags + 1)])
-    own = own / own[lags]
-    return max(float(np.sum(correlation * np.outer(own, own))), MIN_SEEN)
+    autocorrelation = np.array([padded @ np.roll(padded, lag) for lag in range(-lags, lags + 1)])
+    autocorrelation = autocorrelation / autocorrelation[lags]
+    return max(float(np.sum(correlation * np.outer(autocorrelation, autocorrelation))), MIN_SEEN)
 
 
 def _correlation(light: NDArray[np.float32], field: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -126,23 +126,23 @@ def _correlation(light: NDArray[np.float32], field: NDArray[np.bool_]) -> NDArra
     # A blur mirrors the light at its border, where a slope would look like noise.
     edge = min(9 * LAGS, top, left)
     wider = light[top - edge : height - top + edge, left - edge : width - left + edge]
-    rest = wider - cv2.GaussianBlur(wider, (0, 0), 3 * LAGS)
-    rest = rest[edge : edge + height - 2 * top, edge : edge + width - 2 * left]
+    residual = wider - cv2.GaussianBlur(wider, (0, 0), 3 * LAGS)
+    residual = residual[edge : edge + height - 2 * top, edge : edge + width - 2 * left]
     field = field[top : height - top, left : width - left]
     white = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
     white[LAGS, LAGS] = 1
     if np.count_nonzero(field) < MIN_PIXELS:
         return white
-    limit = 3 * 1.4826 * float(np.median(np.abs(rest[field])))
-    valid = (field & (np.abs(rest) < limit)).astype(np.float32)
+    limit = 3 * 1.4826 * float(np.median(np.abs(residual[field])))
+    valid = (field & (np.abs(residual) < limit)).astype(np.float32)
     valid = cv2.erode(valid, np.ones((3, 3), np.uint8))
-    rest = rest * valid
+    residual = residual * valid
     if valid.sum() < MIN_PIXELS:
         return white
-    total = float(np.sum(rest * rest)) / float(valid.sum())
-    if total < MIN_VARIANCE:
+    mean_square = float(np.sum(residual * residual)) / float(valid.sum())
+    if mean_square < MIN_VARIANCE:
         return white
-    return correlation_of(rest[None], valid[None])
+    return correlation_of(residual[None], valid[None])
 
 
 def correlation_of(
@@ -155,21 +155,21 @@ def correlation_of(
     """
     # With an edge of zeros, a lag along both axes is a lag in the flattened pixels.
     edge_of_zeros = ((0, 0), (0, LAGS), (0, LAGS))
-    value, seen = (np.pad(one, edge_of_zeros).reshape(-1) for one in (residual, valid))
-    total = float(value @ value) / max(float(seen.sum()), 1.0)
+    value, weight = (np.pad(array, edge_of_zeros).reshape(-1) for array in (residual, valid))
+    mean_square = float(value @ value) / max(float(weight.sum()), 1.0)
     out = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
     for row in range(LAGS + 1):
         for column in range(-LAGS if row else 0, LAGS + 1):
             lag = row * (residual.shape[2] + LAGS) + column
             stop = len(value) - lag
-            pairs = max(float(seen[:stop] @ seen[lag:]), 1.0)
+            pairs = max(float(weight[:stop] @ weight[lag:]), 1.0)
             products = float(value[:stop] @ value[lag:])
-            mean = products / pairs / max(total, 1e-300)
+            mean = products / pairs / max(mean_square, 1e-300)
             out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = mean
     edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
     out = np.clip((out - edge) / max(1 - edge, 1 - MAX_SLOW), 0, 1)
     # Correlations of white noise scatter by one over the root of the number of pixels.
-    out[out < SURE_CORRELATION / np.sqrt(max(float(seen.sum()), 1.0))] = 0
+    out[out < SURE_CORRELATION / np.sqrt(max(float(weight.sum()), 1.0))] = 0
     out[LAGS, LAGS] = 1
     return out
 
@@ -189,21 +189,23 @@ def less_common(
     the result is scaled to compensate for both. Invalid residuals are 0.
     """
     differing = np.column_stack([place, np.log(size)])
-    away = differing - differing.mean(axis=0)
-    x, y, z = (away / np.maximum(np.abs(away).max(axis=0, initial=0.0), 1e-6)).T
+    centred = differing - differing.mean(axis=0)
+    x, y, z = (centred / np.maximum(np.abs(centred).max(axis=0, initial=0.0), 1e-6)).T
     terms = np.stack([*(x**i * y**j for i, j in POLYNOMIAL), z, z * z], axis=1)
     prior = np.eye(terms.shape[1], dtype=residual.dtype)
-    known = terms[usual].astype(residual.dtype)
-    products = (known[:, :, None] * known[:, None]).reshape(-1, prior.size)
-    of_pixel = (valid[usual].T.astype(residual.dtype) @ products).reshape(-1, *prior.shape)
-    right = residual[usual].T @ known
-    coefficients = np.linalg.solve(of_pixel + prior, right[..., None])
+    usual_terms = terms[usual].astype(residual.dtype)
+    products = (usual_terms[:, :, None] * usual_terms[:, None]).reshape(-1, prior.size)
+    pixel_normal = (valid[usual].T.astype(residual.dtype) @ products).reshape(-1, *prior.shape)
+    right_side = residual[usual].T @ usual_terms
+    coefficients = np.linalg.solve(pixel_normal + prior, right_side[..., None])
     common = terms.astype(residual.dtype) @ coefficients[..., 0].T
-    normal = known.T @ known
+    normal = usual_terms.T @ usual_terms
     influence = np.linalg.solve(normal + prior, terms.T)
-    own = np.sum(terms * influence.T, axis=1)
-    added = np.sum(influence * (normal @ influence), axis=0)
-    noise = np.sqrt(1 + added - np.where(usual, 2 * own, 0.0)).astype(residual.dtype)
+    leverage = np.sum(terms * influence.T, axis=1)
+    common_variance = np.sum(influence * (normal @ influence), axis=0)
+    noise = np.sqrt(1 + common_variance - np.where(usual, 2 * leverage, 0.0)).astype(
+        residual.dtype
+    )
     return (residual - common) * valid / noise[:, None]
 
 
@@ -251,10 +253,10 @@ class Cosines:
         # Scaled so that a background of unit strength has unit variance at a pixel.
         self.variance = power / (power @ np.mean(self.waves**2, axis=1))
         polynomial, _ = np.linalg.qr(np.stack([x**i * y**j for i, j in POLYNOMIAL], axis=1))
-        beyond = np.sqrt(self.variance)[:, None] * self.waves
-        beyond -= (beyond @ polynomial) @ polynomial.T
-        _, vectors = np.linalg.eigh(beyond @ beyond.T)
-        self.telling = (vectors[:, -TELLING:].T @ beyond).astype(dtype)
+        remaining_waves = np.sqrt(self.variance)[:, None] * self.waves
+        remaining_waves -= (remaining_waves @ polynomial) @ polynomial.T
+        _, vectors = np.linalg.eigh(remaining_waves @ remaining_waves.T)
+        self.telling = (vectors[:, -TELLING:].T @ remaining_waves).astype(dtype)
 
     def spectra(
         self,
@@ -272,24 +274,24 @@ class Cosines:
         unknowns = jacobian.shape[1]
         root = np.sqrt(weight)
         shape = (len(jacobian), unknowns + len(self.telling) + 1, jacobian.shape[2])
-        both = np.empty(shape)
-        np.multiply(jacobian, root[:, None], out=both[:, :unknowns])
-        np.multiply((relative * root)[:, None], self.telling, out=both[:, unknowns:-1])
-        np.multiply(residual, root, out=both[:, -1])
-        products = both @ np.swapaxes(both, 1, 2)
-        known = products[:, :unknowns, :unknowns]
+        stacked = np.empty(shape)
+        np.multiply(jacobian, root[:, None], out=stacked[:, :unknowns])
+        np.multiply((relative * root)[:, None], self.telling, out=stacked[:, unknowns:-1])
+        np.multiply(residual, root, out=stacked[:, -1])
+        products = stacked @ np.swapaxes(stacked, 1, 2)
+        normal = products[:, :unknowns, :unknowns]
         diagonal = np.arange(unknowns)
-        known[:, diagonal, diagonal] *= 1 + 1e-9
-        known[:, diagonal, diagonal] += 1e-12
+        normal[:, diagonal, diagonal] *= 1 + 1e-9
+        normal[:, diagonal, diagonal] += 1e-12
         cross = products[:, :unknowns, unknowns:]
-        left = products[:, unknowns:, unknowns:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(
-            known, cross
+        reduced = products[:, unknowns:, unknowns:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(
+            normal, cross
         )
         noise = 1 / np.maximum(np.mean(weight, axis=1), 1e-12)
-        left[:, :-1] *= np.sqrt(noise)[:, None, None]
-        left[:, :, :-1] *= np.sqrt(noise)[:, None, None]
+        reduced[:, :-1] *= np.sqrt(noise)[:, None, None]
+        reduced[:, :, :-1] *= np.sqrt(noise)[:, None, None]
         freedom = np.maximum(np.count_nonzero(weight, axis=1) - unknowns, 1)
-        return Spectra(left, freedom, noise)
+        return Spectra(reduced, freedom, noise)
 
     def eliminated(
         self,
@@ -308,10 +310,10 @@ class Cosines:
         inner = (weighted @ np.swapaxes(waves, 1, 2)).astype(float)
         diagonal = np.arange(len(self.variance))
         inner[:, diagonal, diagonal] += 1 / (strength[:, None] * self.variance)
-        both = np.concatenate([jacobian, residual[:, None].astype(jacobian.dtype)], axis=1)
-        cross = (weighted @ np.swapaxes(both, 1, 2)).astype(float)
-        taken = np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)
-        return taken[:, :-1, :-1], taken[:, :-1, -1], taken[:, -1, -1]
+        stacked = np.concatenate([jacobian, residual[:, None].astype(jacobian.dtype)], axis=1)
+        cross = (weighted @ np.swapaxes(stacked, 1, 2)).astype(float)
+        explained = np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)
+        return explained[:, :-1, :-1], explained[:, :-1, -1], explained[:, -1, -1]
 
 
 @dataclass(frozen=True)
@@ -329,7 +331,7 @@ class Spectra:
         """Return the spectra of all windows of several groups."""
         names = [field.name for field in fields(cls)]
         return cls(
-            **{name: np.concatenate([getattr(one, name) for one in parts]) for name in names}
+            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         )
 
     def strengths(self, excess: float) -> NDArray[np.float64]:
@@ -338,20 +340,20 @@ class Spectra:
         The share of windows with a background and a common factor on the noise are estimated with
         the strengths. excess: variance of slow waves of the noise over that of white noise.
         """
-        log_det, taken = np.stack([self._marginal(ratio / excess) for ratio in RATIOS], axis=1)
+        log_det, explained = np.stack([self._marginal(ratio / excess) for ratio in RATIOS], axis=1)
         squared = self.products[:, -1, -1]
         window = np.arange(len(squared))
         likely = np.zeros(len(squared), dtype=bool)
         best = np.zeros(len(squared), dtype=int)
         for _ in range(ROUNDS):
-            lack = (squared - np.where(likely, taken[best, window], 0.0)) / self.freedom
-            scale = float(np.median(lack))
-            gain = 0.5 * (taken / (scale * excess) - log_det)
+            mean_square = (squared - np.where(likely, explained[best, window], 0.0)) / self.freedom
+            scale = float(np.median(mean_square))
+            gain = 0.5 * (explained / (scale * excess) - log_det)
             best = np.argmax(gain, axis=0)
             likely = _likely(logsumexp(gain, axis=0) - np.log(len(RATIOS)))
-        middle = np.clip(best, 1, len(RATIOS) - 2)
-        between = vertex(*(gain[middle + step, window] for step in (-1, 0, 1)))
-        ratio = RATIOS[best] * np.where(middle == best, STEP**between, 1.0)
+        inner = np.clip(best, 1, len(RATIOS) - 2)
+        offset = vertex(*(gain[inner + step, window] for step in (-1, 0, 1)))
+        ratio = RATIOS[best] * np.where(inner == best, STEP**offset, 1.0)
         return np.where(likely, ratio * self.noise, 0.0)
 
     def _marginal(self, ratio: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -360,8 +362,8 @@ class Spectra:
         diagonal = np.arange(matrix.shape[1])
         matrix[:, diagonal, diagonal] += 1
         pivot = np.linalg.cholesky(matrix)[:, diagonal, diagonal]
-        left = (pivot[:, -1] ** 2 - 1) / ratio
-        return 2 * np.log(pivot[:, :-1]).sum(axis=1), self.products[:, -1, -1] - left
+        unexplained = (pivot[:, -1] ** 2 - 1) / ratio
+        return 2 * np.log(pivot[:, :-1]).sum(axis=1), self.products[:, -1, -1] - unexplained
 
 
 def _likely(evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -370,9 +372,9 @@ def _likely(evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
     Their share is unknown and estimated by expectation-maximisation (Dempster, Laird and Rubin, J.
     R. Stat. Soc. B 39, 1977).
     """
-    least = 0.5 / len(evidence)
+    min_share = 0.5 / len(evidence)
     odds = 0.0
     for _ in range(EM_STEPS):
         share = np.mean(expit(evidence + odds))
-        odds = float(logit(np.clip(share, least, 1 - least)))
+        odds = float(logit(np.clip(share, min_share, 1 - min_share)))
     return np.asarray(evidence + odds > 0)

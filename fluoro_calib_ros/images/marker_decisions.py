@@ -101,9 +101,9 @@ class DecidedView:
 
     def exchange(self, rows: Sequence[int], frame: int, since: int) -> Decision:
         """Exchange two ids that have been swapped since an image."""
-        one, other = self.ids(*rows)
-        self.tracker.exchange(one, other)
-        return Decision('exchanged', self.name, frame, since, (one, other))
+        first_id, second_id = self.ids(*rows)
+        self.tracker.exchange(first_id, second_id)
+        return Decision('exchanged', self.name, frame, since, (first_id, second_id))
 
     def drop(self, row: int, frame: int, since: int) -> Decision:
         """Drop a marker that has been another object since an image."""
@@ -127,11 +127,13 @@ def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:
     ids = found.target_id.copy()
     doubtful = found.doubtful.copy()
     if decision.kind == 'exchanged':
-        one, two = decision.target_id
+        first_id, second_id = decision.target_id
         # The exposure in which they were exchanged is unknown, so they stay doubtful.
         doubtful |= np.isin(found.target_id, decision.target_id)
         ids = np.where(
-            found.target_id == one, two, np.where(found.target_id == two, one, found.target_id)
+            found.target_id == first_id,
+            second_id,
+            np.where(found.target_id == second_id, first_id, found.target_id),
         )
         return replace(found, target_id=ids, doubtful=doubtful)
     row = found.target_id == decision.target_id[0]
@@ -187,13 +189,13 @@ class EarlierImages:
         """Apply a decision to the images that it covers; return the ids that it changes."""
         out = []
         for row in range(len(self._found) - 1, -1, -1):
-            found = self._found[row]
-            if found.frame < decision.since:
+            markers = self._found[row]
+            if markers.frame < decision.since:
                 break
-            wrong = np.intersect1d(found.target_id, decision.target_id)
-            if decision.kind != 'confirmed' and len(wrong):
-                out.append(Retraction(found.frame, tuple(wrong.tolist())))
-            self._found[row] = revise(found, decision)
+            changed_ids = np.intersect1d(markers.target_id, decision.target_id)
+            if decision.kind != 'confirmed' and len(changed_ids):
+                out.append(Retraction(markers.frame, tuple(changed_ids.tolist())))
+            self._found[row] = revise(markers, decision)
         return out[::-1]
 
 
@@ -225,39 +227,39 @@ class BodyDecisions:
         view = self._view
         seen = exposure.observed[view.view]
         doubtful = exposure.doubtful[view.view]
-        away = np.linalg.norm(seen - place, axis=1)
+        distance = np.linalg.norm(seen - place, axis=1)
         scatter = np.hypot(exposure.sigma[view.view], sd)
-        near = np.maximum(NEAR_PX, NEAR_SIGMAS * scatter)
-        right = away < near
-        wrong = away > FAR * near
+        tolerance = np.maximum(NEAR_PX, NEAR_SIGMAS * scatter)
+        agreeing = distance < tolerance
+        disagreeing = distance > FAR * tolerance
         # A body that only another view shows has uncertain places along the rays of that view.
         contradicted = (sd > NEAR_PX) & (exposure.standardised[view.view] > DISAGREE)
-        right &= ~contradicted
-        wrong |= contradicted
-        self._seen_right[right] = frame
-        view.counts.disagree(wrong)
-        strange = wrong | (away > np.maximum(NEAR_PX, DOUBT_SIGMAS * scatter))
+        agreeing &= ~contradicted
+        disagreeing |= contradicted
+        self._seen_right[agreeing] = frame
+        view.counts.disagree(disagreeing)
+        strange = disagreeing | (distance > np.maximum(NEAR_PX, DOUBT_SIGMAS * scatter))
         view.doubt(np.flatnonzero(strange & ~doubtful), frame)
-        suspects = np.flatnonzero(np.isfinite(away) & (doubtful | (view.counts.wrong > 0)))
-        crossed = _crossed(seen, place, near, suspects)
+        suspects = np.flatnonzero(np.isfinite(distance) & (doubtful | (view.counts.wrong > 0)))
+        crossed = _crossed(seen, place, tolerance, suspects)
         out = [self._exchange(rows, frame) for rows in crossed]
         exchanged = {row for rows in crossed for row in rows}
         for row in suspects.tolist():
             if row in exchanged:
                 continue
-            beside = np.linalg.norm(place - seen[row], axis=1)
-            beside[row] = np.inf
+            separation = np.linalg.norm(place - seen[row], axis=1)
+            separation[row] = np.inf
             # If another marker could be here as well, the doubt stays.
-            alone = np.nanmin(beside, initial=np.inf) > FAR * near[row]
-            out += self._weigh(row, bool(right[row] and alone), frame)
+            is_isolated = np.nanmin(separation, initial=np.inf) > FAR * tolerance[row]
+            out += self._weigh(row, bool(agreeing[row] and is_isolated), frame)
         return out
 
     def _exchange(self, rows: tuple[int, int], frame: int) -> Decision:
         """Exchange two ids, each of which is at the other's predicted place."""
         view = self._view
         # They cannot have been exchanged while one of them agreed with its body.
-        together = int(self._seen_right[list(rows)].max()) + 1
-        since = max(view.doubted_since(rows, frame), together)
+        earliest = int(self._seen_right[list(rows)].max()) + 1
+        since = max(view.doubted_since(rows, frame), earliest)
         view.counts.clear(rows)
         return view.exchange(rows, frame, since)
 
@@ -286,15 +288,15 @@ def _crossed(
     if len(suspects) < 2:
         return []
     distance = np.linalg.norm(seen[suspects][:, None] - place[suspects][None], axis=2)
-    own = np.diagonal(distance)
+    own_distance = np.diagonal(distance)
     nearest = distance.argmin(axis=1).tolist()
     out = []
-    for one, two in enumerate(nearest):
-        if one < two and nearest[two] == one:
-            limit = float(near[suspects[[one, two]]].min())
-            both = max(distance[one, two], distance[two, one])
-            if both < limit and min(own[one], own[two]) > FAR * limit:
-                out.append((int(suspects[one]), int(suspects[two])))
+    for i, j in enumerate(nearest):
+        if i < j and nearest[j] == i:
+            limit = float(near[suspects[[i, j]]].min())
+            crossed_distance = max(distance[i, j], distance[j, i])
+            if crossed_distance < limit and min(own_distance[i], own_distance[j]) > FAR * limit:
+                out.append((int(suspects[i]), int(suspects[j])))
     return out
 
 
@@ -319,27 +321,31 @@ class RayDecisions:
         """Confirm or exchange ids; known (n,): markers that bodies decide on."""
         view = self._view
         out: list[Decision] = []
-        lack = exposure.standardised[view.view]
-        both = np.isfinite(lack) & ~known
-        for row in np.flatnonzero(both & exposure.doubtful[view.view]).tolist():
+        misfit = exposure.standardised[view.view]
+        decidable = np.isfinite(misfit) & ~known
+        for row in np.flatnonzero(decidable & exposure.doubtful[view.view]).tolist():
             (number,) = view.ids(row)
             began = view.tracker.doubted_since(number)
             if began is None:
                 continue
             partners = view.tracker.partners(number)
-            others = [int(np.searchsorted(view.target_id, other)) for other in partners]
-            others = [other for other in others if other != row and both[other]]
-            for other in others:
-                if other > row:
-                    out += self._both_ways(exposure, (row, other), frame)
-            if not others and not partners - {number}:
-                agrees = bool(lack[row] < AGREE)
+            partner_rows = [int(np.searchsorted(view.target_id, partner)) for partner in partners]
+            partner_rows = [
+                partner_row
+                for partner_row in partner_rows
+                if partner_row != row and decidable[partner_row]
+            ]
+            for partner_row in partner_rows:
+                if partner_row > row:
+                    out += self._both_ways(exposure, (row, partner_row), frame)
+            if not partner_rows and not partners - {number}:
+                agrees = bool(misfit[row] < AGREE)
                 if view.counts.agree(row, agrees, frame, began) >= DECIDED_ALONE:
                     out.append(view.confirm(row, frame))
-        rows = np.flatnonzero(both)
-        bad = lack[rows] > DISAGREE
-        view.counts.disagree(bad, rows)
-        view.doubt(rows[bad], frame)
+        rows = np.flatnonzero(decidable)
+        disagreeing = misfit[rows] > DISAGREE
+        view.counts.disagree(disagreeing, rows)
+        view.doubt(rows[disagreeing], frame)
         return out
 
     def _both_ways(
@@ -347,29 +353,31 @@ class RayDecisions:
     ) -> list[Decision]:
         """Compare the epipolar distances of two markers of a view with those after an exchange."""
         view = self._view
-        other = self._rays.exchanged(exposure, view.view, rows)
-        lack = exposure.standardised[view.view, list(rows)]
-        if not (lack < AGREE).all() and not (other < AGREE).all():
+        exchanged_misfit = self._rays.exchanged(exposure, view.view, rows)
+        misfit = exposure.standardised[view.view, list(rows)]
+        if not (misfit < AGREE).all() and not (exchanged_misfit < AGREE).all():
             # One of them is another object; this exposure is no evidence for the other exposures.
             if rows in self._evidence:
                 self._kept[rows] = frame + 1
             return []
-        keep = np.minimum(lack**2, MAX_COST).sum()
-        change = np.minimum(np.nan_to_num(other, nan=np.inf) ** 2, MAX_COST).sum()
-        if change < keep or rows not in self._evidence:
+        kept_cost = np.minimum(misfit**2, MAX_COST).sum()
+        exchanged_cost = np.minimum(
+            np.nan_to_num(exchanged_misfit, nan=np.inf) ** 2, MAX_COST
+        ).sum()
+        if exchanged_cost < kept_cost or rows not in self._evidence:
             self._kept[rows] = frame
-        self._evidence[rows] = self._evidence.get(rows, 0.0) + float(change - keep)
+        self._evidence[rows] = self._evidence.get(rows, 0.0) + float(exchanged_cost - kept_cost)
         if abs(self._evidence[rows]) < MAX_COST:
             return []
         exchanged = self._evidence.pop(rows) < 0
-        kept = self._kept.pop(rows)
+        since = self._kept.pop(rows)
         out = []
         if exchanged:
             out.append(view.exchange(rows, frame, view.doubted_since(rows, frame)))
-            kept = frame
+            since = frame
         ids = view.ids(*rows)
         view.tracker.part(*ids)
         for number in ids:
             if view.tracker.doubted_since(number) is None:
-                out.append(Decision('confirmed', view.name, frame, kept, (number,)))
+                out.append(Decision('confirmed', view.name, frame, since, (number,)))
         return out

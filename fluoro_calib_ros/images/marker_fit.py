@@ -137,9 +137,9 @@ class _MarkerFit(ShadowFit):
                 final = step == (STEPS_ALONE if alone else self.settings.steps) - 1
                 moved[rows] = self._take_step(rows, near, final)
         for rows, near in self.groups:
-            again = moved[rows] > CONVERGED_PX
-            if again.any():
-                self._take_step(rows[again], near[again], True)
+            unconverged = moved[rows] > CONVERGED_PX
+            if unconverged.any():
+                self._take_step(rows[unconverged], near[unconverged], True)
 
     def _take_step(
         self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
@@ -186,8 +186,8 @@ class _MarkerFit(ShadowFit):
         self, rows: NDArray[np.int64], near: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return light (g, m) and its derivatives (g, OWN + 3 k, m)."""
-        everyone = np.concatenate([rows[:, None], near], axis=1)
-        shadow, by_u, by_v = self._shadow(everyone, self.middle[rows])
+        members = np.concatenate([rows[:, None], near], axis=1)
+        shadow, by_u, by_v = self._shadow(members, self.middle[rows])
         scatter = self.profile.scatter
         plane = self._plane(rows)
         if not near.shape[1]:  # the same in fewer operations
@@ -200,17 +200,17 @@ class _MarkerFit(ShadowFit):
             np.multiply(by_place, by_v[:, 0], out=jacobian[:, TERMS + 1])
             np.multiply(by_shadow, shadow[:, 0], out=jacobian[:, TERMS + 2])
             return plane * relative, jacobian
-        there = everyone >= 0
-        depth = np.where(there, self.depth[everyone], 0.0)[..., None]
+        exists = members >= 0
+        depth = np.where(exists, self.depth[members], 0.0)[..., None]
         passed = np.maximum(1 - depth * shadow, MIN_PASSED)
         product = np.prod(passed, axis=1)
         relative = scatter + (1 - scatter) * (product + self._crossing_in(rows))
-        jacobian = self._jacobian(relative, everyone.shape[1])
+        jacobian = self._jacobian(relative, members.shape[1])
         by_shadow = -(1 - scatter) * (plane * product)[:, None] / passed
         by_place = by_shadow * depth
         jacobian[:, TERMS::3] = by_place * by_u
         jacobian[:, TERMS + 1 :: 3] = by_place * by_v
-        jacobian[:, TERMS + 2 :: 3] = by_shadow * shadow * there[..., None]
+        jacobian[:, TERMS + 2 :: 3] = by_shadow * shadow * exists[..., None]
         return plane * relative, jacobian
 
     def _disturbed(
@@ -248,26 +248,26 @@ class _MarkerFit(ShadowFit):
         self.crossing = np.zeros((len(self.uv), len(self.offset)))
         grid = FineGrid(self.offset, self.profile.blur_px)
         axis = grid.axis
-        for one in rows:
-            others = np.flatnonzero(self.close[one])[: self.settings.neighbours]
-            members = np.concatenate([[one], others])
-            together = np.zeros((len(axis), len(axis)))
+        for row in rows:
+            neighbours = np.flatnonzero(self.close[row])[: self.settings.neighbours]
+            members = np.concatenate([[row], neighbours])
+            joint = np.zeros((len(axis), len(axis)))
             for weight, way in zip(self.way_weight, self.way):
-                passed = np.ones_like(together)
+                passed = np.ones_like(joint)
                 for member in members:
-                    u, v = self.uv[member] + way[member] - self.middle[one]
+                    u, v = self.uv[member] + way[member] - self.middle[row]
                     squared = (axis[:, None] - v) ** 2 + (axis - u) ** 2
                     passed *= 1 - self.depth[member] * self.profile.absorbed(squared)
-                together += weight * passed
-            shadow, _, _ = self._shadow(members[None], self.middle[one][None])
-            apart = np.prod(1 - self.depth[members][:, None] * shadow[0], axis=0)
-            self.crossing[one] = grid.blurred(together) - apart
+                joint += weight * passed
+            shadow, _, _ = self._shadow(members[None], self.middle[row][None])
+            separate = np.prod(1 - self.depth[members][:, None] * shadow[0], axis=0)
+            self.crossing[row] = grid.blurred(joint) - separate
 
     def result(self) -> Beads:
         """Return the measured markers."""
-        away = np.abs(self.uv - self.start).max(axis=1, initial=0.0)
+        displacement = np.abs(self.uv - self.start).max(axis=1, initial=0.0)
         measured = self.usable & np.isfinite(self.uv).all(axis=1) & np.isfinite(self.sigma)
-        measured &= away < self.settings.steps * self.settings.max_step_px
+        measured &= displacement < self.settings.steps * self.settings.max_step_px
         return self._beads(measured, self.typical())
 
 
@@ -345,14 +345,14 @@ class MarkerMeasurement:
         for row in np.flatnonzero(~assigned):
             if motion.variance[row] > reach**2:
                 continue
-            away = np.linalg.norm(start - motion.uv[row], axis=1)
-            away[~assigned] = np.inf
-            other = int(np.argmin(away))
-            if away[other] < reach:
-                between = 0.5 * (motion.uv[row] + motion.uv[other])
-                shift = start[other] - between
+            distance = np.linalg.norm(start - motion.uv[row], axis=1)
+            distance[~assigned] = np.inf
+            neighbour = int(np.argmin(distance))
+            if distance[neighbour] < reach:
+                midpoint = 0.5 * (motion.uv[row] + motion.uv[neighbour])
+                shift = start[neighbour] - midpoint
                 start[row] = motion.uv[row] + shift
-                start[other] = motion.uv[other] + shift
+                start[neighbour] = motion.uv[neighbour] + shift
                 assigned[row] = True
 
     def _acceptable(
@@ -360,9 +360,9 @@ class MarkerMeasurement:
     ) -> NDArray[np.bool_]:
         """Return (k,) whether fitted shadows belong to the markers in rows (k,)."""
         relative = beads.depth / states.depth[rows]
-        away = beads.uv - states.motion.uv[rows]
+        offset = beads.uv - states.motion.uv[rows]
         variance = states.motion.innovation_variance(np.zeros(1))[rows] + beads.sigma**2
         good = beads.measured & (beads.sigma < MAX_SIGMA_PX) & (beads.misfit < MAX_MISFIT)
-        good &= (away * away).sum(axis=1) < (self._gate + 1) ** 2 * variance
+        good &= (offset * offset).sum(axis=1) < (self._gate + 1) ** 2 * variance
         good &= (relative > DEPTH[0]) & (relative < DEPTH[1])
         return good

@@ -134,16 +134,18 @@ class _ImageSearch:
         """Search for the missing bodies; the strongest shadows of a size determine their look."""
         try:
             with ThreadPoolExecutor(len(self._images)) as threads:
-                parts = threads.map(_shadows_of, self._images.values(), repeat((scale, strongest)))
-                shadows = list(parts)
+                results = threads.map(
+                    _shadows_of, self._images.values(), repeat((scale, strongest))
+                )
+                shadows = list(results)
         except DataError as error:
             self._reason = self._reason or error
             return
-        found, missing = find_bodies(shadows, self._rig, self.missing)
+        markers, missing = find_bodies(shadows, self._rig, self.missing)
         self._reason = self._reason or next(iter(missing.values()), None)
         self.missing = [body for body in self.missing if body.name in missing]
-        for name, first in found.items():
-            self._found.setdefault(name, []).append(first)
+        for name, view_markers in markers.items():
+            self._found.setdefault(name, []).append(view_markers)
 
     def markers(self) -> dict[str, FirstMarkers]:
         """Return the markers by fluoroscope. Raises DataError if no two fluoroscopes see some."""
@@ -155,8 +157,8 @@ class _ImageSearch:
             raise DataError(f'fluoroscope {blind} sees none of the bodies that others see')
         return {
             name: FirstMarkers(
-                np.concatenate([first.target_id for first in parts]),
-                np.concatenate([first.uv for first in parts]),
+                np.concatenate([part.target_id for part in parts]),
+                np.concatenate([part.uv for part in parts]),
                 self._images[name],
             )
             for name, parts in self._found.items()
@@ -195,27 +197,27 @@ def find_bodies(
             missing[body.name] = error
             continue
         fits.append((body, fit))
-        taken = points.shadow[fit.point[fit.point >= 0]]
+        used_shadows = points.shadow[fit.point[fit.point >= 0]]
         # A shadow belongs to one marker, unless two lie behind each other.
-        free &= ~all_among(points.shadow, taken)
-    found = {}
+        free &= ~all_among(points.shadow, used_shadows)
+    first_markers = {}
     for view, name in enumerate(rig.orientation.fluoroscopes):
-        first = _first(view, rig, fits, points, shadows[view])
-        if first is not None:
-            found[name] = first
-    return found, missing
+        view_markers = _first(view, rig, fits, points, shadows[view])
+        if view_markers is not None:
+            first_markers[name] = view_markers
+    return first_markers, missing
 
 
 def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
     """Find the members of a body among points. Raises DataError."""
     search = _Search(body, points, free)
     search.run()
-    least = max(MIN_MEMBERS, int(np.ceil(MIN_SHARE * len(body.target_id))))
+    min_count = max(MIN_MEMBERS, int(np.ceil(MIN_SHARE * len(body.target_id))))
     best = search.best
-    if best is None or best.count < least:
-        found = 0 if best is None else best.count
+    if best is None or best.count < min_count:
+        count = 0 if best is None else best.count
         raise DataError(
-            f'body {body.name}: only {found} of {len(body.target_id)} markers fit its shape '
+            f'body {body.name}: only {count} of {len(body.target_id)} markers fit its shape '
             'in this exposure'
         )
     if _by_chance(body, best, points.xyz[free]) > MAX_CHANCE:
@@ -226,7 +228,7 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
     # If a body fits in more than one way, keep the members on which all ways agree.
     rivals = [fit.point for fit in search.fits if fit.chi2 < BETTER * best.chi2]
     best = best.only((np.array(rivals) == best.point).all(axis=0))
-    if best.count < least:
+    if best.count < min_count:
         raise DataError(
             f'body {body.name}: its shape fits in more than one way in this exposure, its '
             'distances do not tell the markers apart'
@@ -261,16 +263,16 @@ class _Search:
         self.body = body
         self.points = points
         xyz = points.xyz
-        wanted = squareform(pdist(body.xyz_mm))
-        given = squareform(pdist(xyz))
+        member_distances = squareform(pdist(body.xyz_mm))
+        point_distance = squareform(pdist(xyz))
         variance = points.variance[:, None] + points.variance
         # Whether two points may be two members: (member, member, point, point).
         self.may_be = [
             [
-                (given - distance) ** 2 < AGREE**2 * (variance + one**2 + other**2)
-                for distance, other in zip(of_member, body.sd_mm)
+                (point_distance - distance) ** 2 < AGREE**2 * (variance + sd_a**2 + sd_b**2)
+                for distance, sd_b in zip(row, body.sd_mm)
             ]
-            for of_member, one in zip(wanted, body.sd_mm)
+            for row, sd_a in zip(member_distances, body.sd_mm)
         ]
         self.free = free
         self.fits: list[_Fit] = []  # fits with as many members as the best
@@ -291,9 +293,9 @@ class _Search:
             raise DataError(f'body {self.body.name}: too many round shadows to search')
         size = len(self.point)
         point = self.point.tolist()
-        chosen = [other for other in range(member) if point[other] >= 0]
-        least = self.fits[0].count if self.fits else MIN_MEMBERS
-        if len(chosen) + size - member < least:
+        chosen = [earlier for earlier in range(member) if point[earlier] >= 0]
+        min_count = self.fits[0].count if self.fits else MIN_MEMBERS
+        if len(chosen) + size - member < min_count:
             return
         if member == size:
             self.choices.append(self.point.copy())
@@ -301,14 +303,14 @@ class _Search:
             if len(self.choices) > self.judged:
                 self._judge()
             return
-        fits = free.copy()
-        for other in chosen:
-            fits &= self.may_be[member][other][point[other]]
-        for number in fits.nonzero()[0].tolist():
-            self.point[member] = number
-            free[number] = False
+        allowed = free.copy()
+        for earlier in chosen:
+            allowed &= self.may_be[member][earlier][point[earlier]]
+        for candidate in allowed.nonzero()[0].tolist():
+            self.point[member] = candidate
+            free[candidate] = False
             self._extend(member + 1, free)
-            free[number] = True
+            free[candidate] = True
         self.point[member] = -1
         self._extend(member + 1, free)
 
@@ -327,9 +329,9 @@ class _Search:
             point = choices[choices >= 0].reshape(-1, count)
             xyz = self.points.xyz[point]
             variance = self.points.variance[point] + self.body.sd_mm[member] ** 2
-            given = self.body.xyz_mm[member]
-            rotation, shift = fitted_pose(given, xyz, 1 / variance)
-            fitted = given @ np.swapaxes(rotation, 1, 2) + shift[:, None]
+            body_xyz = self.body.xyz_mm[member]
+            rotation, shift = fitted_pose(body_xyz, xyz, 1 / variance)
+            fitted = body_xyz @ np.swapaxes(rotation, 1, 2) + shift[:, None]
             squares = np.sum((fitted - xyz) ** 2, axis=2)
             chi2 = np.sum(squares / variance, axis=1)
             good = np.flatnonzero(chi2 <= chdtri(3 * count - POSE_SIZE, CHANCE))
@@ -370,5 +372,5 @@ def _first(
         inside = ((place > 0) & (place < np.array([width - 1, height - 1]))).all(axis=1)
         ids.append(np.asarray(body.target_id)[inside])
         places.append(place[inside])
-    found = np.concatenate(ids)
-    return FirstMarkers(found, np.concatenate(places)) if len(found) else None
+    target_id = np.concatenate(ids)
+    return FirstMarkers(target_id, np.concatenate(places)) if len(target_id) else None

@@ -64,8 +64,8 @@ class Shadows:
         order = np.argsort(-self.strength, kind='stable')
         uv = self.uv[order]
         tree = cKDTree(uv)
-        again = {int(two) for one, two in tree.query_pairs(SAME_PX) if one < two}
-        kept = order[[number for number in range(len(order)) if number not in again]]
+        duplicates = {int(j) for i, j in tree.query_pairs(SAME_PX) if i < j}
+        kept = order[[number for number in range(len(order)) if number not in duplicates]]
         return Shadows(self.uv[kept], self.strength[kept])
 
 
@@ -118,8 +118,8 @@ class FilteredLight:
     @cached_property
     def maxima(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns (k,) of the local maxima of the relative response."""
-        around = np.ones((2 * max(1, round(self.scale)) + 1,) * 2, np.uint8)
-        dilated = cv2.dilate(self.relative, around)
+        kernel = np.ones((2 * max(1, round(self.scale)) + 1,) * 2, np.uint8)
+        dilated = cv2.dilate(self.relative, kernel)
         largest = self.relative >= dilated
         largest &= self.relative > 0
         row, column = np.divmod(np.flatnonzero(largest), largest.shape[1])
@@ -155,10 +155,10 @@ class FilteredImage:
         """Return the image filtered for dark shadows and for bright shadows."""
         if scale not in self._by_scale:
             dark, bright = self._lights
-            of_both = responses(dark[0], scale)
+            filtered = responses(dark[0], scale)
             self._by_scale[scale] = (
-                FilteredLight(scale, False, dark[0], of_both[0], dark[1]),
-                FilteredLight(scale, True, bright[0], of_both[1], bright[1]),
+                FilteredLight(scale, False, dark[0], filtered[0], dark[1]),
+                FilteredLight(scale, True, bright[0], filtered[1], bright[1]),
             )
         return self._by_scale[scale]
 
@@ -232,9 +232,11 @@ def _learn_look(
         lights: Sequence[FilteredLight] = image.of_scale(scale)
         if best is not None and best.clear:  # then the polarity is known
             lights = lights[int(best.light.inverted) :][:1]
-        found = max((_Typical.near(one, near) for one in lights), key=lambda one: one.snr)
-        if best is None or found.merit > best.merit:
-            best = found
+        candidate = max(
+            (_Typical.near(light, near) for light in lights), key=lambda typical: typical.snr
+        )
+        if best is None or candidate.merit > best.merit:
+            best = candidate
         elif best.clear:
             break  # beyond the size of the markers, the response decreases
     assert best is not None
@@ -247,7 +249,9 @@ def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
     lights: dark and bright light of one size. count: number of strongest shadows from which the
     appearance is learned. Raises DataError if there is nothing round.
     """
-    best = max((_Typical.strongest(light, count) for light in lights), key=lambda one: one.snr)
+    best = max(
+        (_Typical.strongest(light, count) for light in lights), key=lambda typical: typical.snr
+    )
     look = best.look('there are no markers in the image, nothing round rises above the noise')
     return _found(look, best.light)
 
@@ -355,13 +359,13 @@ def search_windows(
     searched = np.zeros((len(middle), size, size), dtype=bool)
     inner = np.s_[:, border:-border, border:-border]
     searched[inner] = valid.reshape(searched.shape)[inner]
-    found = _found(replace(look, field=searched.reshape(-1, size)), light)
-    number = (found.uv[:, 1] + 0.5).astype(int) // size
-    place = found.uv.copy()
+    shadows = _found(replace(look, field=searched.reshape(-1, size)), light)
+    number = (shadows.uv[:, 1] + 0.5).astype(int) // size
+    place = shadows.uv.copy()
     place[:, 1] -= number * size
     place += middle[number] - half - border
     # Overlapping windows contain the same shadow.
-    return Shadows(place, found.strength).distinct() if len(place) else found
+    return Shadows(place, shadows.strength).distinct() if len(place) else shadows
 
 
 @lru_cache(maxsize=64)
@@ -405,18 +409,18 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
     given = uv[known]
     inside = ((given > -0.5) & (given < np.array([width, height]) - 0.5)).all(axis=1)
     if not inside.all():
-        bad = int(target_id[known][~inside][0])
-        raise DataError(f'marker {bad} of the first frame lies outside of the image')
+        outside_id = int(target_id[known][~inside][0])
+        raise DataError(f'marker {outside_id} of the first frame lies outside of the image')
     look, filtered = _learn_look(image, given)
-    found = _found(look, filtered)
-    row, column = assign(given, np.full(len(given), GIVEN_SD_PX**2), found.uv, GIVEN_GATE)
+    shadows = _found(look, filtered)
+    row, column = assign(given, np.full(len(given), GIVEN_SD_PX**2), shadows.uv, GIVEN_GATE)
     if len(row) < max(1, len(given) // 2):
         raise DataError(
             f'only {len(row)} of {len(given)} markers of the first frame are in the image'
         )
     seen = np.flatnonzero(known)[row]
     place = np.where(known[:, None], uv, NOWHERE_PX)
-    place[seen] = found.uv[column]
+    place[seen] = shadows.uv[column]
     unseen = np.ones(len(uv), dtype=int)
     unseen[seen] = 0
     light = filtered.light
@@ -428,7 +432,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         ),
         noise=estimate_noise(light, look.field),
         size=(width, height),
-        density=max((len(found.uv) - len(row)) / max(look.field.sum(), 1), MIN_DENSITY),
+        density=max((len(shadows.uv) - len(row)) / max(look.field.sum(), 1), MIN_DENSITY),
     )
 
 
@@ -470,13 +474,13 @@ class MarkerSearch:
         if lost.any() and number % self._every == 0:
             parts.append(self._of_strip(image, number // self._every % self._strips))
         reach = np.ceil(self._gate * np.sqrt(states.shadow_variance))
-        near = ~lost | (reach <= MAX_HALF)
+        in_windows = ~lost | (reach <= MAX_HALF)
         half = np.minimum(reach, MAX_HALF).astype(int)
         middle = np.rint(states.motion.uv).astype(int)
         # Few markers need wide windows; the other windows stay small.
-        sizes = np.sort(half[near])
-        small = int(sizes[3 * len(sizes) // 4]) if len(sizes) else 0
-        for rows in (near & (half <= small), near & (half > small)):
+        sizes = np.sort(half[in_windows])
+        small_half = int(sizes[3 * len(sizes) // 4]) if len(sizes) else 0
+        for rows in (in_windows & (half <= small_half), in_windows & (half > small_half)):
             if rows.any():
                 size = int(half[rows].max())
                 parts.append(search_windows(windows, middle[rows], size, self._look))
@@ -492,9 +496,9 @@ class MarkerSearch:
         top, bottom = (height * edge // self._strips for edge in (strip, strip + 1))
         margin = BACKGROUND_PX + int(np.ceil(BORDER * self._look.scale))
         first = max(top - margin, 0)
-        seen = slice(first, min(bottom + margin, height))
-        look = replace(self._look, field=self._look.field[seen])
-        found = search_image(image[seen], look)
-        uv = found.uv + [0, first]
+        strip_rows = slice(first, min(bottom + margin, height))
+        look = replace(self._look, field=self._look.field[strip_rows])
+        shadows = search_image(image[strip_rows], look)
+        uv = shadows.uv + [0, first]
         inside = (uv[:, 1] >= top - 0.5) & (uv[:, 1] < bottom - 0.5)
-        return Shadows(uv[inside], found.strength[inside])
+        return Shadows(uv[inside], shadows.strength[inside])

@@ -114,10 +114,10 @@ class Motion:
         self.velocity[rows] += gain[:, 1:] * innovation
         self.covariance[rows] = p - gain[:, :, None] * p[:, None, 0, :]
         # Acceleration from the innovation; a first or late innovation has little information.
-        seen = 0.5 * (innovation**2).sum(axis=1) / float(frames) ** 4
-        seen = np.maximum(seen - sigma**2, 0)
-        update = FORGET * self.squared[rows] + (1 - FORGET) * seen
-        self.squared[rows] = np.where(settled, update, self.squared[rows])
+        observed = 0.5 * (innovation**2).sum(axis=1) / float(frames) ** 4
+        observed = np.maximum(observed - sigma**2, 0)
+        smoothed = FORGET * self.squared[rows] + (1 - FORGET) * observed
+        self.squared[rows] = np.where(settled, smoothed, self.squared[rows])
 
     def lead(
         self, seen: NDArray[np.bool_], before: NDArray[np.float64], sure: NDArray[np.bool_]
@@ -133,17 +133,17 @@ class Motion:
             return led
         velocity = self.velocity[rows]
         difference = ((velocity[:, None] - velocity[None]) ** 2).sum(axis=2)
-        both = np.ix_(rows, rows)
+        pairs = np.ix_(rows, rows)
         learned = sure[rows, None] & sure[rows]
-        self.together[both] += learned
-        share = learned * np.maximum(1 / np.maximum(self.together[both], 1), 1 - FORGET)
-        before_unlike = np.where(learned & (self.together[both] == 1), 0.0, self.unlike[both])
-        np.fill_diagonal(before_unlike, 0.0)
-        self.unlike[both] = (1 - share) * before_unlike + share * difference
+        self.together[pairs] += learned
+        share = learned * np.maximum(1 / np.maximum(self.together[pairs], 1), 1 - FORGET)
+        unlike_before = np.where(learned & (self.together[pairs] == 1), 0.0, self.unlike[pairs])
+        np.fill_diagonal(unlike_before, 0.0)
+        self.unlike[pairs] = (1 - share) * unlike_before + share * difference
         self.unlike[rows, rows] = np.inf
         for row in np.flatnonzero(~seen & self.settled).tolist():
-            alike = self.company(row, rows)
-            self.velocity[row] += np.median(self.velocity[alike] - before[alike], axis=0)
+            company = self.company(row, rows)
+            self.velocity[row] += np.median(self.velocity[company] - before[company], axis=0)
             led[row] = True
         return led
 
@@ -152,8 +152,8 @@ class Motion:
 
         If it is not known which do, return the nearest.
         """
-        away = np.linalg.norm(self.uv[among] - self.uv[row], axis=1)
-        return among[np.lexsort((away, self.unlike[row, among]))[:LEADERS]]
+        distance = np.linalg.norm(self.uv[among] - self.uv[row], axis=1)
+        return among[np.lexsort((distance, self.unlike[row, among]))[:LEADERS]]
 
     def strangeness(
         self, seen: NDArray[np.bool_]
@@ -166,13 +166,13 @@ class Motion:
         rows = np.flatnonzero(seen & self.settled)
         if len(rows) <= LEADERS:
             return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, 2))
-        both = np.ix_(rows, rows)
-        unlike = np.where(self.together[both] < COMPARED, np.inf, self.unlike[both])
+        pairs = np.ix_(rows, rows)
+        unlike = np.where(self.together[pairs] < COMPARED, np.inf, self.unlike[pairs])
         order = np.argsort(unlike, axis=1, kind='stable')[:, :LEADERS]
         usual = np.take_along_axis(unlike, order, axis=1).mean(axis=1)
-        others = np.median(self.velocity[rows][order], axis=1)
-        squared = ((self.velocity[rows] - others) ** 2).sum(axis=1)
-        return rows, squared / (usual + UNSTEADY_PX**2), others
+        company_velocity = np.median(self.velocity[rows][order], axis=1)
+        squared = ((self.velocity[rows] - company_velocity) ** 2).sum(axis=1)
+        return rows, squared / (usual + UNSTEADY_PX**2), company_velocity
 
     def place(
         self,
@@ -220,8 +220,8 @@ def costs(
     uv: NDArray[np.float64], variance: NDArray[np.float64], found: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return costs (n, m), -2 log-likelihood, of places (m, 2) for predictions uv (n, 2)."""
-    away = uv[:, None] - found[None]
-    squared = (away * away).sum(axis=2)
+    offset = uv[:, None] - found[None]
+    squared = (offset * offset).sum(axis=2)
     return squared / variance[:, None] + 2 * np.log(variance)[:, None]
 
 
@@ -238,11 +238,11 @@ def assign(
     if not len(uv) or not len(found):
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
     cost = costs(uv, variance, found)
-    away = uv[:, None] - found[None]
-    inside = (away * away).sum(axis=2) < gate_sigmas**2 * variance[:, None]
+    offset = uv[:, None] - found[None]
+    inside = (offset * offset).sum(axis=2) < gate_sigmas**2 * variance[:, None]
     row, column = linear_sum_assignment(np.where(inside, cost, FAR))
-    good = inside[row, column]
-    return row[good], column[good]
+    accepted = inside[row, column]
+    return row[accepted], column[accepted]
 
 
 def common_shift(
@@ -252,13 +252,13 @@ def common_shift(
 
     uv (n, 2) are predictions, beside (k,) the rows of its neighbours.
     """
-    near = found.query_ball_point(uv[row], reach_px)
-    if not near:
+    nearby = found.query_ball_point(uv[row], reach_px)
+    if not nearby:
         return None
-    shift = found.data[near] - uv[row]
-    there = found.query((uv[beside][None] + shift[:, None]).reshape(-1, 2))[0]
-    close = np.minimum(there.reshape(len(near), -1) / GIVEN_SD_PX, 1.0)
-    score = (1 - close**2).sum(axis=1) - 0.5 * np.linalg.norm(shift, axis=1) / reach_px
+    shift = found.data[nearby] - uv[row]
+    distance = found.query((uv[beside][None] + shift[:, None]).reshape(-1, 2))[0]
+    relative = np.minimum(distance.reshape(len(nearby), -1) / GIVEN_SD_PX, 1.0)
+    score = (1 - relative**2).sum(axis=1) - 0.5 * np.linalg.norm(shift, axis=1) / reach_px
     best = int(np.argmax(score))
     if score[best] < MIN_VOTES:
         return None
@@ -287,13 +287,13 @@ def doubtful_pairs(
         Least increase of -2 log-likelihood that excludes an exchange.
     """
     cost = costs(uv, variance, np.where(measured[:, None], found, FAR))
-    own = np.where(measured, np.diagonal(cost), 0.0)
-    other = np.where(measured[None], cost, 0.0)
+    own_cost = np.where(measured, np.diagonal(cost), 0.0)
+    exchanged_cost = np.where(measured[None], cost, 0.0)
     # Both measured: exchanged. One measured: its place may belong to the other.
-    excess = other + other.T - own[:, None] - own[None]
-    there = measured[:, None] | measured[None]
-    one, two = np.nonzero(np.triu(there & (excess < margin), 1))
-    return np.stack([one, two], axis=1)
+    excess = exchanged_cost + exchanged_cost.T - own_cost[:, None] - own_cost[None]
+    is_possible = measured[:, None] | measured[None]
+    i, j = np.nonzero(np.triu(is_possible & (excess < margin), 1))
+    return np.stack([i, j], axis=1)
 
 
 # States of markers between images: motion, depth of the shadow, number of images unseen.
@@ -319,11 +319,11 @@ class MeasuredMarkers:
     @classmethod
     def nothing(cls, count: int) -> MeasuredMarkers:
         """Return the result of an image in which none of the markers is seen."""
-        nowhere = np.zeros(count, dtype=bool)
-        none = np.zeros(count)
+        unmeasured = np.zeros(count, dtype=bool)
+        zero = np.zeros(count)
         uv = np.zeros((count, 2))
         free = np.zeros((0, 2))
-        return cls(nowhere, uv, uv, sigma=none, depth=none, overlapped=nowhere, free=free)
+        return cls(unmeasured, uv, uv, sigma=zero, depth=zero, overlapped=unmeasured, free=free)
 
 
 @dataclass
@@ -362,17 +362,17 @@ class MarkerStates:
         near the given place anyway keep their state.
         """
         motion = self.motion
-        away = ((uv - motion.uv[rows]) ** 2).sum(axis=1)
-        there = away < GIVEN_GATE**2 * (motion.variance[rows] + GIVEN_SD_PX**2)
-        elsewhere = ~there | (self.unseen[rows] > 1) | (self.placed[rows] < RECENT)
-        rows, uv = rows[elsewhere], uv[elsewhere]
-        again = there[elsewhere] & (self.placed[rows] < RECENT)
-        again &= self.unseen[rows] <= self.placed[rows]
-        since = (self.unseen[rows] + frames - 1)[:, None]  # frames since they were measured
-        before = motion.uv[rows] - since * motion.velocity[rows]
-        velocity = np.where(again[:, None], (uv - before) / since, 0.0)
+        squared = ((uv - motion.uv[rows]) ** 2).sum(axis=1)
+        is_expected = squared < GIVEN_GATE**2 * (motion.variance[rows] + GIVEN_SD_PX**2)
+        is_moved = ~is_expected | (self.unseen[rows] > 1) | (self.placed[rows] < RECENT)
+        rows, uv = rows[is_moved], uv[is_moved]
+        is_repeated = is_expected[is_moved] & (self.placed[rows] < RECENT)
+        is_repeated &= self.unseen[rows] <= self.placed[rows]
+        elapsed = (self.unseen[rows] + frames - 1)[:, None]  # frames since they were measured
+        last_uv = motion.uv[rows] - elapsed * motion.velocity[rows]
+        velocity = np.where(is_repeated[:, None], (uv - last_uv) / elapsed, 0.0)
         motion.redirect(rows, uv, velocity, GIVEN_SD_PX)
-        motion.covariance[rows[~again], 1, 1] = FIRST_SPEED_PX**2
+        motion.covariance[rows[~is_repeated], 1, 1] = FIRST_SPEED_PX**2
         self.unseen[rows] = 1
         self.placed[rows] = 0
 
@@ -382,11 +382,11 @@ class MarkerStates:
         self.motion.update(rows, found.uv[rows], found.sigma[rows], frames)
         self.unseen[rows] = 0
         # The depth of a shadow is only known if no other shadow overlaps.
-        free = rows[~found.overlapped[rows]]
-        first = self.depth_sd[free] > KNOWN_DEPTH_SD
+        separate = rows[~found.overlapped[rows]]
+        first = self.depth_sd[separate] > KNOWN_DEPTH_SD
         memory = np.where(first, 0.0, FORGET)
-        self.depth[free] = memory * self.depth[free] + (1 - memory) * found.depth[free]
-        self.depth_sd[free] = KNOWN_DEPTH_SD
+        self.depth[separate] = memory * self.depth[separate] + (1 - memory) * found.depth[separate]
+        self.depth_sd[separate] = KNOWN_DEPTH_SD
 
     def exchange(self, one: int, other: int) -> None:
         """Exchange the states of two markers."""

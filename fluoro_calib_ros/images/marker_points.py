@@ -37,7 +37,7 @@ class ShadowPoints:
 
 def all_among(shadow: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return whether all shadows (n, F) of points are also shadows (k, F) of other points."""
-    among = [np.isin(mine, theirs) for mine, theirs in zip(shadow.T, others.T)]
+    among = [np.isin(column, other_column) for column, other_column in zip(shadow.T, others.T)]
     return np.asarray((np.column_stack(among) | (shadow < 0)).all(axis=1))
 
 
@@ -59,10 +59,10 @@ def shadow_points(shadows: Sequence[NDArray[np.float64]], rig: CalibratedRig) ->
         if not len(open_rows) or not len(shadows[view]):
             continue
         _, nearest = cKDTree(shadows[view]).query(rig.project(view, xyz[open_rows]))
-        joined = shadow[open_rows]
-        joined[:, view] = nearest
-        points, agree = rays.intersect(joined)
-        shadow[open_rows[agree]] = joined[agree]
+        extended = shadow[open_rows]
+        extended[:, view] = nearest
+        points, agree = rays.intersect(extended)
+        shadow[open_rows[agree]] = extended[agree]
         xyz[open_rows[agree]] = points.xyz_mm[agree]
     kept = _explaining(shadow)
     shadow, xyz = shadow[kept], xyz[kept]
@@ -71,13 +71,13 @@ def shadow_points(shadows: Sequence[NDArray[np.float64]], rig: CalibratedRig) ->
 
 def _explaining(shadow: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return rows (k,) of distinct points that are needed to explain shadows (n, F)."""
-    _, once = np.unique(shadow, axis=0, return_index=True)
-    rows = np.sort(once)
+    _, first = np.unique(shadow, axis=0, return_index=True)
+    rows = np.sort(first)
     count = (shadow[rows] >= 0).sum(axis=1)
     keep = np.ones(len(rows), dtype=bool)
     for rays in range(shadow.shape[1], 2, -1):
-        more = shadow[rows[keep & (count >= rays)]]
-        keep &= (count >= rays) | ~all_among(shadow[rows], more)
+        supported = shadow[rows[keep & (count >= rays)]]
+        keep &= (count >= rays) | ~all_among(shadow[rows], supported)
     return rows[keep]
 
 
@@ -93,17 +93,17 @@ class _Rays:
         """Return rows (n, F) of the pairs of shadows whose rays meet, -1 for other views."""
         names = self._orientation.fluoroscopes
         out = [np.zeros((0, len(names)), dtype=np.int64)]
-        for one, other in combinations(range(len(names)), 2):
-            views = self._corrected[one], self._corrected[other]
+        for view_a, view_b in combinations(range(len(names)), 2):
+            views = self._corrected[view_a], self._corrected[view_b]
             a, b = np.indices((len(views[0].uv), len(views[1].uv))).reshape(2, -1)
             uv = np.stack([views[0].uv[a], views[1].uv[b]])
             sigma = np.hypot(np.stack([views[0].sigma[a], views[1].sigma[b]]), SHADOW_SD_PX)
-            geometry = EpipolarGeometry(self._orientation, names[one], names[other])
+            geometry = EpipolarGeometry(self._orientation, names[view_a], names[view_b])
             rays = geometry.residuals(uv[0], uv[1], sigma[0], sigma[1])
-            near = np.abs(rays.residual) < AGREE * rays.sd_total
-            shadow = np.full((np.count_nonzero(near), len(names)), -1)
-            shadow[:, one] = a[near]
-            shadow[:, other] = b[near]
+            meeting = np.abs(rays.residual) < AGREE * rays.sd_total
+            shadow = np.full((np.count_nonzero(meeting), len(names)), -1)
+            shadow[:, view_a] = a[meeting]
+            shadow[:, view_b] = b[meeting]
             out.append(shadow)
         return np.concatenate(out)
 
@@ -111,11 +111,11 @@ class _Rays:
         """Intersect shadows (n, F); return the points, and whether (n,) all their rays meet."""
         uv = self._uv(shadow)
         sigma = np.full(uv.shape[:2], np.nan)
-        for view, (of_view, row) in enumerate(zip(self._corrected, shadow.T)):
-            there = row >= 0
-            sigma[view, there] = np.hypot(of_view.sigma[row[there]], SHADOW_SD_PX)
-        points, lack = self._fit.intersect(uv, sigma)
-        agree = np.isin(points.status, (OK, OUTSIDE)) & ((lack < AGREE) | (shadow.T < 0)).all(
+        for view, (corrected, row) in enumerate(zip(self._corrected, shadow.T)):
+            has_shadow = row >= 0
+            sigma[view, has_shadow] = np.hypot(corrected.sigma[row[has_shadow]], SHADOW_SD_PX)
+        points, misfit = self._fit.intersect(uv, sigma)
+        agree = np.isin(points.status, (OK, OUTSIDE)) & ((misfit < AGREE) | (shadow.T < 0)).all(
             axis=0
         )
         return points, agree
@@ -132,7 +132,7 @@ class _Rays:
     def _uv(self, shadow: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return corrected image points (F, n, 2) [px], NaN if there is no shadow."""
         uv = np.full((shadow.shape[1], len(shadow), 2), np.nan)
-        for view, (of_view, row) in enumerate(zip(self._corrected, shadow.T)):
-            there = row >= 0
-            uv[view, there] = of_view.uv[row[there]]
+        for view, (corrected, row) in enumerate(zip(self._corrected, shadow.T)):
+            has_shadow = row >= 0
+            uv[view, has_shadow] = corrected.uv[row[has_shadow]]
         return uv

@@ -98,11 +98,13 @@ class MarkerPlaces:
 
         share: time of the extrapolation, as a share of the time between the two.
         """
-        way = share * (self.xyz_mm - before.xyz_mm)
-        wider = (1 + share) ** 2 * self.covariance + share**2 * before.covariance
+        displacement = share * (self.xyz_mm - before.xyz_mm)
+        covariance = (1 + share) ** 2 * self.covariance + share**2 * before.covariance
         # The uncertainty of the extrapolation is as large as the motion itself, along any axis.
-        unsteady = np.sum(way * way, axis=1)[:, None, None] / 3 * np.eye(3)
-        return MarkerPlaces(self.xyz_mm + way, wider + unsteady)
+        motion_covariance = (
+            np.sum(displacement * displacement, axis=1)[:, None, None] / 3 * np.eye(3)
+        )
+        return MarkerPlaces(self.xyz_mm + displacement, covariance + motion_covariance)
 
 
 STEPS = 3  # fixed-point iterations: the correction changes slowly
@@ -174,16 +176,16 @@ class MarkerRays:
         sigma, correction_sd = np.full((2, *shape), np.nan)
         doubtful = np.zeros(shape, dtype=bool)
         for view, name in enumerate(self._names):
-            found = views[name]
-            rows = np.searchsorted(self._target_id, found.target_id)
-            observed[view, rows] = found.uv
+            markers = views[name]
+            rows = np.searchsorted(self._target_id, markers.target_id)
+            observed[view, rows] = markers.uv
             u, v, total, sd, _ = self._calibrations[name].correct_arrays(
-                found.uv[:, 0].copy(), found.uv[:, 1].copy(), found.sigma, angles.get(name)
+                markers.uv[:, 0].copy(), markers.uv[:, 1].copy(), markers.sigma, angles.get(name)
             )
             corrected[view, rows] = np.stack([u, v], axis=1)
             sigma[view, rows] = np.hypot(total, SYSTEMATIC_PX)
             correction_sd[view, rows] = np.hypot(sd, SYSTEMATIC_PX)
-            doubtful[view, rows] = found.doubtful
+            doubtful[view, rows] = markers.doubtful
         points, standardised = self._fit.intersect(corrected, sigma)
         outside = np.zeros(sigma.shape, dtype=bool)
         matched = MatchedViews(self._target_id, corrected, sigma, correction_sd, outside)
@@ -252,16 +254,18 @@ class RayFit:
         rows = np.flatnonzero((points.rays > 2) & misses)
         if not len(rows):
             return points, standardised
-        fewer = self._without_false.intersect(uv[:, rows], sigma[:, rows])
-        found = fewer.dropped_view >= 0
-        kept = rows[found]
-        others = np.arange(len(uv))[:, None] != fewer.dropped_view[found]
-        lack = (fewer.standardised * self._scale[fewer.rays])[found]
-        standardised[:, kept] = np.where(others & seen[:, kept], lack, standardised[:, kept])
+        reduced = self._without_false.intersect(uv[:, rows], sigma[:, rows])
+        has_dropped = reduced.dropped_view >= 0
+        reduced_rows = rows[has_dropped]
+        remaining = np.arange(len(uv))[:, None] != reduced.dropped_view[has_dropped]
+        misfit = (reduced.standardised * self._scale[reduced.rays])[has_dropped]
+        standardised[:, reduced_rows] = np.where(
+            remaining & seen[:, reduced_rows], misfit, standardised[:, reduced_rows]
+        )
         values = {}
         for field in fields(IntersectedPoints):
             values[field.name] = getattr(points, field.name).copy()
-            values[field.name][kept] = getattr(fewer, field.name)[found]
+            values[field.name][reduced_rows] = getattr(reduced, field.name)[has_dropped]
         return IntersectedPoints(**values), standardised
 
 
@@ -287,9 +291,9 @@ class MarkerBodies:
         self._count = len(target_id)
         self._bodies = []
         for body in bodies:
-            there = np.isin(body.target_id, target_id)
-            if np.count_nonzero(there) >= MIN_MEMBERS:
-                self._bodies.append(body.rows(there))
+            is_tracked = np.isin(body.target_id, target_id)
+            if np.count_nonzero(is_tracked) >= MIN_MEMBERS:
+                self._bodies.append(body.rows(is_tracked))
         self._rows = [np.searchsorted(target_id, body.target_id) for body in self._bodies]
         # For all markers of bodies: the body, and the row in the body.
         self._member = (
@@ -363,12 +367,12 @@ class MarkerBodies:
         usable = self._usable(exposure)
         views = exposure.intersected.views
         views = replace(views, uv=np.where(usable[..., None], views.uv, np.nan))
-        found = self._tracker.add(
+        tracked = self._tracker.add(
             IntersectedViews(views, exposure.intersected.points), frame, frame * FRAME_NS
         )
-        if found is not None:
-            covariance = found.covariance[:, POSE, POSE]
-            self.present = self._placed(found.rotation, found.centre_mm, covariance)
+        if tracked is not None:
+            covariance = tracked.covariance[:, POSE, POSE]
+            self.present = self._placed(tracked.rotation, tracked.centre_mm, covariance)
 
     def _usable(self, exposure: MarkerExposure) -> NDArray[np.bool_]:
         """Return the image points (F, n) whose ids are trusted."""
@@ -410,25 +414,25 @@ class MarkerBodies:
         """Improve the shapes with an exposure, of which sure (n,) markers are trusted."""
         if self._tracker is None:
             return
-        away = np.linalg.norm(exposure.xyz_mm - self.present.xyz_mm, axis=1)
-        use = sure & ~(away >= AGREE * RIGID_MM)
+        displacement = np.linalg.norm(exposure.xyz_mm - self.present.xyz_mm, axis=1)
+        trusted = sure & ~(displacement >= AGREE * RIGID_MM)
         changed = False
         for number, rows in enumerate(self._rows):
             known = self._bodies[number].known
-            fresh = use[rows] & (self._learned[number] < LEARNED)
-            if np.count_nonzero(use[rows]) < MIN_MEMBERS or not fresh.any():
+            is_new = trusted[rows] & (self._learned[number] < LEARNED)
+            if np.count_nonzero(trusted[rows]) < MIN_MEMBERS or not is_new.any():
                 continue
-            self._learned[number] += fresh
-            xyz = np.where(use[rows][:, None], exposure.xyz_mm[rows], np.nan)
+            self._learned[number] += is_new
+            xyz = np.where(trusted[rows][:, None], exposure.xyz_mm[rows], np.nan)
             covariance = exposure.intersected.points.covariance_noise[rows]
             self._seen[number].append((xyz, covariance))
             count = len(self._seen[number])
             # Relearn after twice as many exposures, and for each new marker.
-            if count & (count - 1) == 0 or count == LEARNED or (fresh & ~known).any():
+            if count & (count - 1) == 0 or count == LEARNED or (is_new & ~known).any():
                 self._bodies[number] = learned_shape(
                     self._bodies[number],
                     np.stack([places for places, _ in self._seen[number]]),
-                    np.stack([of_places for _, of_places in self._seen[number]]),
+                    np.stack([covariances for _, covariances in self._seen[number]]),
                 )
                 changed = True
         if changed:

@@ -69,16 +69,18 @@ class MarkerViews:
         self.target_id = np.unique(
             np.concatenate(
                 [
-                    *(given.target_id for given in first.values() if given is not None),
+                    *(markers.target_id for markers in first.values() if markers is not None),
                     *(body.target_id[body.known] for body in bodies),
                     entering,
                 ]
             )
         )
-        rigid = [body.target_id for body in bodies]
-        others = np.intersect1d(self.target_id, np.concatenate([*rigid, entering]))
+        body_ids = [body.target_id for body in bodies]
+        possible_ids = np.intersect1d(self.target_id, np.concatenate([*body_ids, entering]))
         self.trackers = {
-            name: MarkerTracker(options, first=first[name], later=_later(others, first[name]))
+            name: MarkerTracker(
+                options, first=first[name], later=_later(possible_ids, first[name])
+            )
             for name in self.names
         }
         self._joined: JoinedViews | None = None
@@ -108,13 +110,17 @@ class MarkerViews:
             joined.expect(images, frame, angles or {})
         trackers = self.trackers
         if all(tracker.begun for tracker in trackers.values()):
-            found = {name: one.update(images.get(name), frame) for name, one in trackers.items()}
+            frames = {
+                name: tracker.update(images.get(name), frame) for name, tracker in trackers.items()
+            }
         else:  # initialisation takes the time of ten images
             with ThreadPoolExecutor(len(trackers)) as threads:
-                given = [images.get(name) for name in trackers]
-                each = threads.map(MarkerTracker.update, trackers.values(), given, repeat(frame))
-                found = dict(zip(trackers, each))
-        return ViewsFrame(found) if joined is None else joined.decided(found, frame)
+                tracker_images = [images.get(name) for name in trackers]
+                results = threads.map(
+                    MarkerTracker.update, trackers.values(), tracker_images, repeat(frame)
+                )
+                frames = dict(zip(trackers, results))
+        return ViewsFrame(frames) if joined is None else joined.decided(frames, frame)
 
 
 def _later(target_id: NDArray[np.int64], given: FirstMarkers | None) -> NDArray[np.int64]:
@@ -219,10 +225,10 @@ class JoinedViews:
         """Doubt the measured markers of bodies that are not at their expected places."""
         views = [view for view in self._views if _is_of_image(found[view.name])]
         rows = [view.view for view in views]
-        before = self._measured[rows]
+        measured_before = self._measured[rows]
         for view in views:
             self._measured[view.view] = np.isin(self._target_id, found[view.name].target_id)
-        missed = self._bodies.miss(self._measured[rows], before)
+        missed = self._bodies.miss(self._measured[rows], measured_before)
         if missed.any():
             self._next_search = 0
             self._pause = 1
@@ -258,19 +264,19 @@ class JoinedViews:
 
         placed (n,): markers of bodies that have just been found.
         """
-        before = self._bodies.present
-        now = self._bodies.predicted(frame)
-        for view, told in zip(self._views, self._told):
-            here = now.filled(told.expected(frame))
-            last = before.filled(told.places)
+        present_places = self._bodies.present
+        predicted_places = self._bodies.predicted(frame)
+        for view, reported in zip(self._views, self._told):
+            expected = predicted_places.filled(reported.expected(frame))
+            previous = present_places.filled(reported.places)
             rows = np.searchsorted(self._target_id, view.tracker.unsure())
-            rows = rows[(here.known & last.known & ~placed)[rows]]
+            rows = rows[(expected.known & previous.known & ~placed)[rows]]
             if not len(rows):
                 continue
-            uv = self._rig.project(view.view, here.xyz_mm[rows])
-            uv_before = self._rig_before.project(view.view, last.xyz_mm[rows])
+            uv = self._rig.project(view.view, expected.xyz_mm[rows])
+            uv_before = self._rig_before.project(view.view, previous.xyz_mm[rows])
             velocity = (uv - uv_before) / (frame - self._frame)
-            sd = self._rig.spread(view.view, here.xyz_mm[rows], here.covariance[rows])
+            sd = self._rig.spread(view.view, expected.xyz_mm[rows], expected.covariance[rows])
             view.tracker.suggest(self._target_id[rows], uv, velocity, sd)
 
     def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> NDArray[np.bool_]:
@@ -286,22 +292,24 @@ class JoinedViews:
         if not wanted:
             return placed
         shadows = [self._shadows(view, images.get(view.name)) for view in self._views]
-        if sum(of_view is not None for of_view in shadows) < 2:
+        if sum(view_shadows is not None for view_shadows in shadows) < 2:
             return placed
         if due:
-            every = self._views[0].tracker.options.search_every
+            interval = self._views[0].tracker.options.search_every
             self._next_search = frame + self._pause
-            self._pause = min(2 * self._pause, every)
-        seen = [np.zeros((0, 2)) if of_view is None else of_view for of_view in shadows]
-        found, missing = find_bodies(seen, self._rig, list(wanted.values()))
+            self._pause = min(2 * self._pause, interval)
+        seen = [
+            np.zeros((0, 2)) if view_shadows is None else view_shadows for view_shadows in shadows
+        ]
+        markers, missing = find_bodies(seen, self._rig, list(wanted.values()))
         for view in self._views:
-            if view.name in found:
-                view.tracker.place(found[view.name])
-        there = [body for body in wanted.values() if body.name not in missing]
-        placed = self._among(there)
+            if view.name in markers:
+                view.tracker.place(markers[view.name])
+        found_bodies = [body for body in wanted.values() if body.name not in missing]
+        placed = self._among(found_bodies)
         self._missed &= ~placed
-        before = [body.name for body in self._again]
-        self._again = [body for body in there if body.name not in before]
+        names_before = [body.name for body in self._again]
+        self._again = [body for body in found_bodies if body.name not in names_before]
         return placed
 
     def _shadows(self, view: DecidedView, image: np.ndarray | None) -> NDArray[np.float64] | None:
@@ -320,18 +328,18 @@ class JoinedViews:
         Markers of no body are expected where at least two other views intersect.
         """
         out: list[Decision] = []
-        free = ~self._bodies.present.known
+        missing = ~self._bodies.present.known
         self._told = [
-            told.next(self._rays.by_others(exposure, view, free), frame)
-            for view, told in enumerate(self._told)
+            reported.next(self._rays.by_others(exposure, view, missing), frame)
+            for view, reported in enumerate(self._told)
         ]
-        expected = [self._bodies.present.filled(told.places) for told in self._told]
-        for view, (by_body, of_view) in enumerate(zip(self._by_body, expected)):
-            place = self._rig.project(view, of_view.xyz_mm)
-            sd = self._rig.spread(view, of_view.xyz_mm, of_view.covariance)
+        expected = [self._bodies.present.filled(reported.places) for reported in self._told]
+        for view, (by_body, view_places) in enumerate(zip(self._by_body, expected)):
+            place = self._rig.project(view, view_places.xyz_mm)
+            sd = self._rig.spread(view, view_places.xyz_mm, view_places.covariance)
             out += by_body.decide(exposure, place, sd, frame)
-        for by_rays, of_view in zip(self._by_rays, expected):
-            out += by_rays.decide(exposure, of_view.known | self._missed, frame)
+        for by_rays, view_places in zip(self._by_rays, expected):
+            out += by_rays.decide(exposure, view_places.known | self._missed, frame)
         return tuple(out)
 
 

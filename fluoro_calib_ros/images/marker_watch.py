@@ -86,21 +86,21 @@ class MarkerWatch:
         pairs = doubtful_pairs(motion.uv, variance, measured, found.uv, self._margin)
         # After the first image, exchanges cannot be recognised before a velocity is known.
         settled = motion.settled | is_first
-        apart = np.linalg.norm(motion.uv[pairs[:, 0]] - motion.uv[pairs[:, 1]], axis=1)
-        for (one, two), distance in zip(pairs.tolist(), apart.tolist()):
-            both_settled = settled[one] and settled[two]
-            if measured[one] and measured[two]:
+        distances = np.linalg.norm(motion.uv[pairs[:, 0]] - motion.uv[pairs[:, 1]], axis=1)
+        for (i, j), distance in zip(pairs.tolist(), distances.tolist()):
+            both_settled = settled[i] and settled[j]
+            if measured[i] and measured[j]:
                 if not both_settled:
                     continue
             else:
                 if not (both_settled or distance < MERGED_PX):
                     continue
-                if max(states.unseen[one], states.unseen[two]) <= self._lost_after:
-                    measured[one] = measured[two] = False
+                if max(states.unseen[i], states.unseen[j]) <= self._lost_after:
+                    measured[i] = measured[j] = False
                     continue
-            if two not in self._doubts.partners(one):
-                self._doubts.add_pair(one, two, frame)
-                ids = (int(self._target_id[one]), int(self._target_id[two]))
+            if j not in self._doubts.partners(i):
+                self._doubts.add_pair(i, j, frame)
+                ids = (int(self._target_id[i]), int(self._target_id[j]))
                 out.append(doubt_in(Kind.SHADOWS_MET, frame, *ids))
         return replace(found, measured=measured), tuple(out)
 
@@ -126,11 +126,11 @@ class MarkerWatch:
             return ()
         variance = motion.variance[rows] + SHADOW_SD_PX**2
         # Use the places before the fit: it may move to another shadow that fits better.
-        own = ((motion.uv[rows] - found.shadow[rows]) ** 2).sum(axis=1) / variance
-        away = motion.uv[rows][:, None] - found.free[None]
-        other = (away**2).sum(axis=2) / variance[:, None]
+        own_squared = ((motion.uv[rows] - found.shadow[rows]) ** 2).sum(axis=1) / variance
+        offset = motion.uv[rows][:, None] - found.free[None]
+        free_squared = (offset**2).sum(axis=2) / variance[:, None]
         out = []
-        for row in rows[other.min(axis=1) - own < self._margin].tolist():
+        for row in rows[free_squared.min(axis=1) - own_squared < self._margin].tolist():
             if row not in self._doubts.partners(row):
                 out.append(self._doubt(Kind.OTHER_SHADOW, row, frame))
         return tuple(out)
@@ -202,8 +202,8 @@ class MarkerDoubts:
 
     def confirm(self, row: int) -> None:
         """Revoke all doubts in a marker."""
-        for other in self._partners[row] - {row}:
-            self._partners[other].discard(row)
+        for partner in self._partners[row] - {row}:
+            self._partners[partner].discard(row)
         self._partners[row].clear()
 
     def confirm_alone(self, row: int) -> None:
@@ -237,10 +237,10 @@ def follow_beside(states: MarkerStates, frames: int) -> None:
     """
     motion = states.motion
     unsettled = np.flatnonzero(~motion.settled & (states.placed > 0)).tolist()
-    beside = {row: velocity_beside(states, row) for row in unsettled}
-    for row, found in beside.items():
-        if found is not None:
-            velocity, spread = found
+    estimates = {row: velocity_beside(states, row) for row in unsettled}
+    for row, estimate in estimates.items():
+        if estimate is not None:
+            velocity, spread = estimate
             uv = motion.uv[row] + frames * (velocity - motion.velocity[row])
             motion.redirect(row, uv, velocity, max(spread, GIVEN_SD_PX))
 
@@ -248,13 +248,13 @@ def follow_beside(states: MarkerStates, frames: int) -> None:
 def velocity_beside(states: MarkerStates, row: int) -> tuple[NDArray[np.float64], float] | None:
     """Return the velocity (2,) of a marker's company and its spread; None without a company."""
     motion = states.motion
-    known = np.flatnonzero(motion.settled & (states.unseen <= 1))
-    known = known[known != row]
-    if len(known) < LEADERS:
+    candidates = np.flatnonzero(motion.settled & (states.unseen <= 1))
+    candidates = candidates[candidates != row]
+    if len(candidates) < LEADERS:
         return None
-    beside = motion.company(row, known)
-    velocity = np.median(motion.velocity[beside], axis=0)
-    return velocity, float(np.abs(motion.velocity[beside] - velocity).max())
+    company = motion.company(row, candidates)
+    velocity = np.median(motion.velocity[company], axis=0)
+    return velocity, float(np.abs(motion.velocity[company] - velocity).max())
 
 
 def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: int) -> None:
@@ -264,19 +264,21 @@ def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: in
     are hardly other shadows. frames: number of frames since the previous image.
     """
     motion = states.motion
-    wide = (~motion.settled | (gate * np.sqrt(motion.variance) > MAX_HALF)) & (states.placed > 0)
-    if not wide.any() or len(found.uv) < 2 or len(motion.uv) < 2:
+    is_uncertain = (~motion.settled | (gate * np.sqrt(motion.variance) > MAX_HALF)) & (
+        states.placed > 0
+    )
+    if not is_uncertain.any() or len(found.uv) < 2 or len(motion.uv) < 2:
         return
     tree = cKDTree(found.uv)
     before = motion.uv.copy()
-    for row in np.flatnonzero(wide).tolist():
-        beside = np.argsort(np.linalg.norm(before - before[row], axis=1), kind='stable')
+    for row in np.flatnonzero(is_uncertain).tolist():
+        neighbours = np.argsort(np.linalg.norm(before - before[row], axis=1), kind='stable')
         # If two bones overlap, half of the nearest markers belong to the other bone.
-        beside = beside[(beside != row) & wide[beside]][: 2 * LEADERS]
-        if not len(beside):
+        neighbours = neighbours[(neighbours != row) & is_uncertain[neighbours]][: 2 * LEADERS]
+        if not len(neighbours):
             continue
         reach = gate * float(np.sqrt(motion.variance[row]))
-        shift = common_shift(before, row, beside, tree, reach)
+        shift = common_shift(before, row, neighbours, tree, reach)
         if shift is not None:
             velocity = motion.velocity[row]
             if not motion.settled[row]:
@@ -300,17 +302,17 @@ class MarkerCompany:
         measured (n,): measured now, `frames` after the previous image; doubtful (n,): the id may
         be wrong.
         """
-        rows, ratio, others = motion.strangeness(measured)
+        rows, ratio, company_velocity = motion.strangeness(measured)
         strange = np.where(ratio > STRANGE, self._strange[rows] + 1, 0)
         self._strange[rows] = strange
-        self._shared[rows] += others * frames
+        self._shared[rows] += company_velocity * frames
         self._own[rows] += motion.velocity[rows] * frames
-        way = np.linalg.norm(self._shared[rows], axis=1)
-        apart = np.linalg.norm(self._own[rows] - self._shared[rows], axis=1)
-        far = way > SHARED_PX
+        path_length = np.linalg.norm(self._shared[rows], axis=1)
+        deviation = np.linalg.norm(self._own[rows] - self._shared[rows], axis=1)
+        has_moved = path_length > SHARED_PX
         alone = rows[(strange == STRANGE_FRAMES) & ~doubtful[rows]]
-        together = rows[far & (apart < SHARED * way) & doubtful[rows]]
-        anew = rows[far | ~doubtful[rows]]
-        self._shared[anew] = 0.0
-        self._own[anew] = 0.0
+        together = rows[has_moved & (deviation < SHARED * path_length) & doubtful[rows]]
+        restarted = rows[has_moved | ~doubtful[rows]]
+        self._shared[restarted] = 0.0
+        self._own[restarted] = 0.0
         return alone.tolist(), together.tolist()

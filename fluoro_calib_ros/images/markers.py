@@ -102,8 +102,8 @@ class FirstMarkers:
         if uv.shape != (len(ids), 2):
             raise DataError(f'{len(ids)} markers, but places of shape {uv.shape}')
         if not np.isfinite(uv).all():
-            bad = ids[~np.isfinite(uv).all(axis=1)][0]
-            raise DataError(f'marker {bad} of the first frame has no place')
+            unplaced_id = ids[~np.isfinite(uv).all(axis=1)][0]
+            raise DataError(f'marker {unplaced_id} of the first frame has no place')
         unique, count = np.unique(ids, return_counts=True)
         if (count > 1).any():
             raise DataError(f'marker {unique[count > 1][0]} occurs twice in the first frame')
@@ -214,9 +214,10 @@ class MarkerTracker:
     ) -> None:
         self.options = options or MarkerOptions()
         self.first = first
-        none = np.zeros(0, dtype=np.int64)
-        known = none if first is None else first.target_id
-        self.target_id = np.append(known, none if later is None else later)  # ids of all markers
+        no_ids = np.zeros(0, dtype=np.int64)
+        first_ids = no_ids if first is None else first.target_id
+        # Ids of all markers.
+        self.target_id = np.append(first_ids, no_ids if later is None else later)
         self._rows = {number: row for row, number in enumerate(self.target_id.tolist())}
         self._followed: _Followed | None = None
         self._frame = 0
@@ -259,11 +260,11 @@ class MarkerTracker:
             return self._result(nothing, (), error.finding, begin)
         self._advance(frame)
         self._followed = start or followed
-        given = self._place_given()
-        found, doubts = self._measure(image, frame)
-        doubts = self._believe(given, found, doubts)
+        given_rows = self._place_given()
+        markers, doubts = self._measure(image, frame)
+        doubts = self._believe(given_rows, markers, doubts)
         none_seen = Finding(Kind.NO_MARKERS, 'no marker is seen')
-        return self._result(found, doubts, None if found.measured.any() else none_seen, begin)
+        return self._result(markers, doubts, None if markers.measured.any() else none_seen, begin)
 
     def doubted_since(self, target_id: int) -> int | None:
         """Return the image since which an id may be wrong, None if it is certain."""
@@ -373,8 +374,8 @@ class MarkerTracker:
             places[: len(self.first.uv)] = self.first.uv
             return places
         for rows, uv, _, sd in self._suggested:
-            near = _inside(uv, shape) & (sd < GIVEN_SD_PX)
-            places[rows[near]] = uv[near]
+            usable = _inside(uv, shape) & (sd < GIVEN_SD_PX)
+            places[rows[usable]] = uv[usable]
         if np.isfinite(places[:, 0]).sum() < MIN_MEMBERS or frame < self._tried:
             raise DataError('no marker is seen', kind=Kind.NO_MARKERS)
         self._tried = frame + self.options.search_every
@@ -406,10 +407,10 @@ class MarkerTracker:
         self, given: NDArray[np.int64], found: MeasuredMarkers, doubts: tuple[Finding, ...]
     ) -> tuple[Finding, ...]:
         """Revoke the doubts in markers whose places were given; return the remaining doubts."""
-        sure = given[found.measured[given]]
-        for row in sure.tolist():
+        confirmed_rows = given[found.measured[given]]
+        for row in confirmed_rows.tolist():
             self._known().doubts.confirm(row)
-        ids = set(self.target_id[sure].tolist())
+        ids = set(self.target_id[confirmed_rows].tolist())
         return tuple(doubt for doubt in doubts if ids.isdisjoint(doubt.place.target_id))
 
     def _measure(
@@ -424,19 +425,19 @@ class MarkerTracker:
         if self._images:
             follow_beside(states, self._gap)
             shift_together(states, shadows, self.options.gate, self._gap)
-        found = followed.measurement.measure(windows, shadows, states)
+        markers = followed.measurement.measure(windows, shadows, states)
         unknown = ~states.motion.settled | (states.unseen > 1)
-        found, doubts = watch.shadows_met(found, states, frame, is_first=self._images == 0)
-        doubts += watch.found_again(found, states, frame)
-        doubts += watch.other_shadows(found, states, frame)
+        markers, doubts = watch.shadows_met(markers, states, frame, is_first=self._images == 0)
+        doubts += watch.found_again(markers, states, frame)
+        doubts += watch.other_shadows(markers, states, frame)
         # In the first image, and at given places, ids are certain.
-        self._anew = found.measured & unknown & (states.placed > 0) & (self._images > 0)
+        self._anew = markers.measured & unknown & (states.placed > 0) & (self._images > 0)
         velocity_before = states.motion.velocity.copy()
-        states.update(found, self._gap)
-        doubts += watch.moving_alone(found, states, frame, self._gap)
+        states.update(markers, self._gap)
+        doubts += watch.moving_alone(markers, states, frame, self._gap)
         sure = ~followed.doubts.doubtful
         self._led = states.motion.lead(states.unseen == 0, velocity_before, sure)
-        return found, doubts
+        return markers, doubts
 
     def _result(
         self,

@@ -182,9 +182,9 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
     """
     best: tuple[GridPose, Match] | None = None
     fitted: list[Match] = []
-    for tried, pose in enumerate(grid_poses(grid, model.xyz, seen, lens)):
+    for number, pose in enumerate(grid_poses(grid, model.xyz, seen, lens)):
         # A right pose is among the first; others that fit as well may come later.
-        if (len(fitted) if best else tried) >= FITTED:
+        if (len(fitted) if best else number) >= FITTED:
             break
         if best and (model.regular or not _could_be(pose, best[0])):
             break
@@ -197,7 +197,7 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
     if best is None:
         return None
     limit = CLOSER * best[1].scale_px
-    rivals = [one for one in fitted if one is not best[1] and one.scale_px < limit]
+    rivals = [rival for rival in fitted if rival is not best[1] and rival.scale_px < limit]
     if not rivals:
         return best[1]
     by_size = _best_by_size([best[1], *rivals], seen, model)
@@ -237,10 +237,10 @@ def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
     If faces are seen from the edge, a pose extends to the far side of the phantom only gradually.
     """
     while not is_sure(one) and one.found >= EVIDENT[1][0] and one.explained >= MIN_EXPLAINED:
-        again = settle(one.view, model.xyz, seen)
-        if again is None or again.score <= one.score:
+        refined = settle(one.view, model.xyz, seen)
+        if refined is None or refined.score <= one.score:
             break
-        one = again
+        one = refined
     return one
 
 
@@ -251,8 +251,8 @@ def is_evident(best: Match) -> bool:
 
 def _check_evidence(best: Match) -> None:
     """Raise DataError if too few predicted beads are found or too few detections are predicted."""
-    enough = best.explained < MIN_EXPLAINED or is_evident(best)
-    if not enough or len(best.bead) < MIN_BEADS:
+    enough_found = best.explained < MIN_EXPLAINED or is_evident(best)
+    if not enough_found or len(best.bead) < MIN_BEADS:
         cause = (
             f'predicts {best.expected} beads in the image, of which only {best.found:.0%} are '
             'found'
@@ -280,15 +280,18 @@ def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = 
     """
     if model.regular:
         return best
-    first, rivals = _climbed(best, seen, model, turn_rad)
-    limit = first.score - max(MARGIN_BEADS, MARGIN * first.score)
-    equal = [one for one in rivals if one.score > limit and not _same(one, first)]
-    closest = min([first, *equal], key=lambda one: one.scale_px)
-    if all(one is closest or one.scale_px > CLOSER * closest.scale_px for one in [first, *equal]):
+    climbed, rivals = _climbed(best, seen, model, turn_rad)
+    limit = climbed.score - max(MARGIN_BEADS, MARGIN * climbed.score)
+    equal = [rival for rival in rivals if rival.score > limit and not _same(rival, climbed)]
+    closest = min([climbed, *equal], key=lambda candidate: candidate.scale_px)
+    if all(
+        candidate is closest or candidate.scale_px > CLOSER * closest.scale_px
+        for candidate in [climbed, *equal]
+    ):
         return closest
-    by_size = _best_by_size([first, *equal], seen, model)
+    by_size = _best_by_size([climbed, *equal], seen, model)
     if by_size is None:
-        raise _ambiguous(first, equal[0])
+        raise _ambiguous(climbed, equal[0])
     return by_size
 
 
@@ -300,17 +303,19 @@ def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Matc
     diameter = model.diameter_mm
     if seen.strength is None or diameter is None or not model.sizes_differ:
         return None
-    common = set.intersection(*(set(one.detection.tolist()) for one in matches))
+    common = set.intersection(*(set(candidate.detection.tolist()) for candidate in matches))
     if len(common) < MIN_BEADS:
         return None
-    rows = [np.flatnonzero(np.isin(one.detection, list(common))) for one in matches]
+    rows = [np.flatnonzero(np.isin(candidate.detection, list(common))) for candidate in matches]
     likelihoods = [
         _likelihood_of_sizes(
-            np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))[row],
-            np.log(np.maximum(seen.strength[one.detection], 1e-3))[row],
-            seen.uv[one.detection][row],
+            np.log(
+                diameter[candidate.bead] / np.abs(candidate.view.depth(model.xyz[candidate.bead]))
+            )[row],
+            np.log(np.maximum(seen.strength[candidate.detection], 1e-3))[row],
+            seen.uv[candidate.detection][row],
         )
-        for one, row in zip(matches, rows)
+        for candidate, row in zip(matches, rows)
     ]
     order = np.argsort(likelihoods)
     if likelihoods[order[-1]] - likelihoods[order[-2]] < LIKELIER:
@@ -331,10 +336,10 @@ def _likelihood_of_sizes(
     y = response - response[near].mean(axis=1)
     slope = np.clip(float(x @ y) / max(float(x @ x), 1e-12), *SIZE_SLOPES)
     level = response - slope * size
-    around = np.median(level[near], axis=1)
-    scatter = 1.4826 * np.median(np.abs(level[near] - around[:, None]), axis=1)
+    local_level = np.median(level[near], axis=1)
+    scatter = 1.4826 * np.median(np.abs(level[near] - local_level[:, None]), axis=1)
     scatter = np.maximum(scatter, np.median(scatter))
-    residual = np.minimum(np.abs(level - around) / np.maximum(scatter, 1e-6), SIZE_TAIL)
+    residual = np.minimum(np.abs(level - local_level) / np.maximum(scatter, 1e-6), SIZE_TAIL)
     return float(-np.sum(np.log(np.maximum(scatter, 1e-6))) - 0.5 * np.sum(residual**2))
 
 
@@ -345,10 +350,10 @@ def _climbed(
 
     On a nearly regular phantom the search finds poses that are several pattern steps off.
     """
-    symmetries = [one for one in model.symmetries if one.turn_rad <= turn_rad]
+    symmetries = [symmetry for symmetry in model.symmetries if symmetry.turn_rad <= turn_rad]
     while True:
         rivals = list(_alternatives(best, seen, model, symmetries))
-        better = max(rivals, key=lambda one: one.score, default=best)
+        better = max(rivals, key=lambda rival: rival.score, default=best)
         if better.score <= best.score:
             return best, rivals
         best = better
@@ -359,13 +364,13 @@ def _alternatives(
 ) -> Iterator[Match]:
     """Yield the matches of the phantom moved by its symmetries, if they fit at all."""
     for symmetry in symmetries:
-        other = symmetry.row[best.bead]
-        known = other >= 0
+        moved_bead = symmetry.row[best.bead]
+        known = moved_bead >= 0
         if np.count_nonzero(known) < MIN_BEADS:
             continue
         view, scale = fit_view(
             symmetry.turned(best.view),
-            model.xyz[other[known]],
+            model.xyz[moved_bead[known]],
             seen.uv[best.detection[known]],
             STEPS,
             0.3,
@@ -380,8 +385,8 @@ def _same(one: Match, other: Match) -> bool:
     """Return whether most beads of the image are matched with the same beads of the phantom."""
     a = dict(zip(one.detection.tolist(), one.bead.tolist()))
     b = dict(zip(other.detection.tolist(), other.bead.tolist()))
-    same = sum(a.get(detection) == bead for detection, bead in b.items())
-    return same > 0.5 * min(len(a), len(b))
+    shared = sum(a.get(detection) == bead for detection, bead in b.items())
+    return shared > 0.5 * min(len(a), len(b))
 
 
 def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
@@ -389,20 +394,20 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
     order = seeds_of(seen)
-    enough = len(order)
+    max_seeds = len(order)
     for (first, last), limits in LEVELS:
         scales = _scales(seen, model, limits)
         if first == CENTRAL:
             radius_mm = seen.radius_px / _scale_by_extent(seen, model)
-            enough = enough_seeds(model.xyz, len(seen.uv), radius_mm, NEIGHBOURS)
-        for seed in order[first : min(last, enough)]:
+            max_seeds = enough_seeds(model.xyz, len(seen.uv), radius_mm, NEIGHBOURS)
+        for seed in order[first : min(last, max_seeds)]:
             for pose in local_poses(
                 seed, seen.uv, NEIGHBOURS[1], model.triples, beads, scales=scales
             ):
                 view = start_view(pose, lens, model.xyz)
-                found = grow(view, pose.bead, model.xyz, seen)
-                if found is not None:
-                    yield found
+                candidate = grow(view, pose.bead, model.xyz, seen)
+                if candidate is not None:
+                    yield candidate
 
 
 def seeds_of(seen: Seen) -> NDArray[np.int64]:
@@ -419,9 +424,9 @@ def seeds_of(seen: Seen) -> NDArray[np.int64]:
     first = np.concatenate([middle[:1], rng.permutation(middle[1:])])[:CENTRAL]
     spacing = seen.tree.query(seen.uv, k=[min(4, n)])[0][:, 0]
     order = np.argsort(-spacing, kind='stable')
-    apart = rng.permutation(order[: int(np.ceil(APART * n))])
-    rest = order[int(np.ceil(APART * n)) :]
-    later = np.concatenate([apart, rest])
+    isolated = rng.permutation(order[: int(np.ceil(APART * n))])
+    crowded = order[int(np.ceil(APART * n)) :]
+    later = np.concatenate([isolated, crowded])
     return np.concatenate([first, later[~np.isin(later, first)]])
 
 
@@ -479,5 +484,5 @@ def _common(steps: NDArray[np.float64], reach: float) -> list[NDArray[np.float64
     """Return the most frequent steps (3,) to a neighbour among steps (n, 3)."""
     cell = np.rint(steps / max(2 * reach, 1e-9)).astype(int)
     _, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    most = np.argsort(-count, kind='stable')[: 2 * SHIFTS]
-    return [steps[inverse.ravel() == number].mean(axis=0) for number in most]
+    order = np.argsort(-count, kind='stable')[: 2 * SHIFTS]
+    return [steps[inverse.ravel() == number].mean(axis=0) for number in order]

@@ -213,8 +213,8 @@ def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> ND
                 width,
                 cv2.LINE_AA,
             )
-    whole = _labelled(picture, lines)
-    return whole[: len(whole) // 2 * 2, : whole.shape[1] // 2 * 2]
+    labelled = _labelled(picture, lines)
+    return labelled[: len(labelled) // 2 * 2, : labelled.shape[1] // 2 * 2]
 
 
 COVERED = (60, 150, 70)  # RGB

@@ -108,8 +108,8 @@ def triples_of(xyz: NDArray[np.float64], neighbours: int) -> Triples:
     a = a[good]
     b = b[good]
     axes = np.linalg.inv(np.stack([a, b, np.cross(a, b)], axis=2))
-    others = near[bead[:, 0], 1 : 1 + voters]
-    offsets = xyz[others] - xyz[bead[:, 0], None]
+    voter_rows = near[bead[:, 0], 1 : 1 + voters]
+    offsets = xyz[voter_rows] - xyz[bead[:, 0], None]
     coordinates = axes @ np.swapaxes(offsets, 1, 2)
     height_mm = np.abs(coordinates[:, 2]) * np.linalg.norm(np.cross(a, b), axis=1)[:, None]
     spacing = np.sqrt(np.minimum(products[0], products[1]))
@@ -182,15 +182,15 @@ def local_poses(
         for i in range(len(near))
         for j in range(i)
     ]
-    found_poses: list[LocalPose] = []
+    poses: list[LocalPose] = []
     for start in range(0, len(sides), PAIRS_AT_ONCE):
         parts = [
             _solutions(p, q, triples, scales) for p, q in sides[start : start + PAIRS_AT_ONCE]
         ]
-        found_poses += _best(parts, triples, centre, found)
-        if any(pose.vote >= SURE_VOTE for pose in found_poses):
+        poses += _best(parts, triples, centre, found)
+        if any(pose.vote >= SURE_VOTE for pose in poses):
             break
-    return sorted(found_poses, key=lambda pose: -pose.vote)[:KEPT]
+    return sorted(poses, key=lambda pose: -pose.vote)[:KEPT]
 
 
 def _best(
@@ -203,12 +203,12 @@ def _best(
     triple, axes, scale = (np.concatenate(values) for values in zip(*parts))
     # A border of pixels around the image represents all places outside it.
     field = np.pad(found, 1, constant_values=2)
-    kept, votes = _elected(centre, axes, triple, triples.voter, field)
-    if len(kept) > MAX_POSES:
-        kept = kept[np.argsort(-votes, kind='stable')[:MAX_POSES]]
-    axes = axes[kept]
-    triple = triple[kept]
-    scale = scale[kept]
+    selected, votes = _elected(centre, axes, triple, triples.voter, field)
+    if len(selected) > MAX_POSES:
+        selected = selected[np.argsort(-votes, kind='stable')[:MAX_POSES]]
+    axes = axes[selected]
+    triple = triple[selected]
+    scale = scale[selected]
     votes = _votes(*_hits(centre, axes, triple, triples.voter, field), len(triples.voter))
     out: list[LocalPose] = []
     seen: set[tuple[int, ...]] = set()
@@ -218,8 +218,8 @@ def _best(
         bead = int(triples.bead[triple[row], 0])
         # Both solutions have the same votes if the neighbours lie in one plane.
         for mirror in (1, -1):
-            both = axes[row] * np.array([[1], [1], [mirror]])
-            rotation = _rotation(triples.sides[triple[row]], both, scale[row])
+            axes_of_side = axes[row] * np.array([[1], [1], [mirror]])
+            rotation = _rotation(triples.sides[triple[row]], axes_of_side, scale[row])
             # Poses of one bead that hardly differ count as one.
             key = (bead, *np.rint(rotation[2] * 4).astype(int).tolist())
             if key not in seen:
@@ -255,16 +255,16 @@ def _solutions(
     # Image of the cross product of both sides; its sign distinguishes the two solutions.
     normal = np.stack([p[1] * second - first * q[1], first * q[0] - p[0] * second], axis=1)
     normal = normal / scale[:, None]
-    other = np.flatnonzero(~triples.planar[row])
-    axes = np.empty((len(row) + len(other), 3, 2), dtype=np.float32)
+    spatial = np.flatnonzero(~triples.planar[row])
+    axes = np.empty((len(row) + len(spatial), 3, 2), dtype=np.float32)
     axes[:, 0] = p
     axes[:, 1] = q
     axes[: len(row), 2] = normal
-    axes[len(row) :, 2] = -normal[other]
+    axes[len(row) :, 2] = -normal[spatial]
     return (
-        np.concatenate([row, row[other]]),
+        np.concatenate([row, row[spatial]]),
         axes,
-        np.concatenate([scale, scale[other]]),
+        np.concatenate([scale, scale[spatial]]),
     )
 
 
@@ -276,11 +276,11 @@ def _elected(
     field: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return rows (k,) of the solutions that the nearest voters preselect, and their votes."""
-    some, nearest = FIRST_VOTERS
-    hits, inside = _hits(centre, axes, triple, voter[:some], field)
+    first_count, second_count = FIRST_VOTERS
+    hits, inside = _hits(centre, axes, triple, voter[:first_count], field)
     row = np.flatnonzero(hits)
-    more = _hits(centre, axes[row], triple[row], voter[some:nearest], field)
-    votes = _votes(hits[row] + more[0], inside[row] + more[1], nearest)
+    remaining = _hits(centre, axes[row], triple[row], voter[first_count:second_count], field)
+    votes = _votes(hits[row] + remaining[0], inside[row] + remaining[1], second_count)
     elected = votes >= FIRST_VOTE
     return row[elected], votes[elected]
 
@@ -393,15 +393,15 @@ def _chances(
     out = []
     for turn in Rotation.random(VIEWS, random_state=0).as_matrix():
         uv = xyz @ turn[:2].T
-        apart = cKDTree(uv).query(uv, k=[2])[0][:, 0] > merged
-        bead = np.flatnonzero(apart & (rng.random(len(xyz)) < MIN_FOUND))
+        resolved = cKDTree(uv).query(uv, k=[2])[0][:, 0] > merged
+        bead = np.flatnonzero(resolved & (rng.random(len(xyz)) < MIN_FOUND))
         if len(bead) < LEAST:
             continue
-        others = round(len(bead) * (1 / share - 1))
-        clutter = rng.uniform(uv.min(axis=0), uv.max(axis=0), (others, 2))
-        number = np.append(bead, np.full(others, -1))
+        clutter_count = round(len(bead) * (1 / share - 1))
+        clutter = rng.uniform(uv.min(axis=0), uv.max(axis=0), (clutter_count, 2))
+        number = np.append(bead, np.full(clutter_count, -1))
         seen = np.concatenate([uv[bead], clutter])
-        around = neighbours_of(seen, np.arange(len(bead)), in_image)
-        own = (number[around][..., None] == near[bead, None, 1:]).any(axis=2)
-        out.append(share * float(np.mean(own.sum(axis=1) >= 2)))
+        nearby = neighbours_of(seen, np.arange(len(bead)), in_image)
+        is_neighbour = (number[nearby][..., None] == near[bead, None, 1:]).any(axis=2)
+        out.append(share * float(np.mean(is_neighbour.sum(axis=1) >= 2)))
     return np.array(out)

@@ -117,10 +117,10 @@ class View:
         )
         points = np.concatenate([x[:, None], rays], axis=1)
         ideal = self.lens.centre + self.principal_distance_px * points[..., :2] / points[..., 2:]
-        bent = self._distortion(ideal.reshape(-1, 2))[0].reshape(ideal.shape)
-        away = (ideal + bent)[:, 1:] - (ideal + bent)[:, :1]
-        along = np.einsum('nkc,kc->nk', away, normal)
-        return np.asarray(2 / CONTOUR * along @ normal)
+        distortion = self._distortion(ideal.reshape(-1, 2))[0].reshape(ideal.shape)
+        offset = (ideal + distortion)[:, 1:] - (ideal + distortion)[:, :1]
+        radial = np.einsum('nkc,kc->nk', offset, normal)
+        return np.asarray(2 / CONTOUR * radial @ normal)
 
     def depth(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return distances (n,) of points (n, 3) from the source along the axis [mm]."""

@@ -192,7 +192,7 @@ class _Base:
         if self._bad is None:
             return folded
         for start in range(0, self._size[1], STRIPE):
-            u, v = (self._between(part, start) for part in cv2.split(change))
+            u, v = (self._between(component, start) for component in cv2.split(change))
             u = u + (np.arange(u.shape[1], dtype=np.float32) + self.margin)
             v = v + (np.arange(start, start + len(v), dtype=np.float32) + self.margin)[:, None]
             bad = cv2.remap(self._bad, u, v, cv2.INTER_NEAREST, borderValue=1) > 0

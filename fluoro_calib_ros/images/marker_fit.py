@@ -174,12 +174,12 @@ class _MarkerFit(ShadowFit):
         if len(self.way) == 1:
             return value[0], -x[0], -y[0]
         weight = self.way_weight.astype(DTYPE)
-        points = len(weight)
+        point_count = len(weight)
         shape = value.shape[1:]
         return (
-            (weight @ value.reshape(points, -1)).reshape(shape),
-            (-weight @ x.reshape(points, -1)).reshape(shape),
-            (-weight @ y.reshape(points, -1)).reshape(shape),
+            (weight @ value.reshape(point_count, -1)).reshape(shape),
+            (-weight @ x.reshape(point_count, -1)).reshape(shape),
+            (-weight @ y.reshape(point_count, -1)).reshape(shape),
         )
 
     def _model(

@@ -79,7 +79,7 @@ def _fluoroscopes(state: SessionState) -> Table | Text:
         ('corrected', _corrected),
     ]
     for label, cell in rows:
-        table.add_row(label, *(_cell(cell(each)) for each in state.fluoroscopes))
+        table.add_row(label, *(_cell(cell(fluoroscope)) for fluoroscope in state.fluoroscopes))
     return table
 
 

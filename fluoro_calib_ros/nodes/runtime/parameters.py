@@ -220,12 +220,17 @@ def group(
 
 def groups_of(settings: type[Any]) -> dict[str, ParameterGroup[Any]]:
     """Return the groups of a settings dataclass by field."""
-    return {each.name: each.metadata[_GROUP] for each in fields(settings)}
+    return {setting.name: setting.metadata[_GROUP] for setting in fields(settings)}
 
 
 def declare_groups(node: Node, settings: type[T]) -> T:
     """Declare the parameters of a settings dataclass; return their values. Raises StartError."""
-    return settings(**{name: each.declare(node) for name, each in groups_of(settings).items()})
+    return settings(
+        **{
+            name: parameter_group.declare(node)
+            for name, parameter_group in groups_of(settings).items()
+        }
+    )
 
 
 def follow_groups(node: Node, present: Callable[[], T], use: Callable[[T], None]) -> None:

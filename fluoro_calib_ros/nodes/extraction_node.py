@@ -163,14 +163,11 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Fol
     try:
         if mode == 'phantom':
             return _of_phantom(expand_path(path), settings.node, logger)
-        first_markers = (
-            _first_markers(expand_path(path), settings.node.fluoroscopes) if path else {}
-        )
+        first = _first_markers(expand_path(path), settings.node.fluoroscopes) if path else {}
         if settings.node.calibration_directory:
-            return [_joined(settings, first_markers)]
+            return [_joined(settings, first)]
         return [
-            MarkerSettings({name: markers}, settings.following)
-            for name, markers in first_markers.items()
+            MarkerSettings({name: markers}, settings.following) for name, markers in first.items()
         ]
     except DataError as error:
         raise StartError(str(error)) from None
@@ -212,12 +209,10 @@ def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> 
     bodies = settings.node.rigid_bodies()
     if settings.node.bodies:
         bodies = read_bodies(expand_path(settings.node.bodies))
-    marker_settings = MarkerSettings(
-        first, settings.following, calibrations, orientation, bodies=bodies
-    )
+    joined = MarkerSettings(first, settings.following, calibrations, orientation, bodies=bodies)
     check_orientation(orientation, calibrations)
-    marker_settings()  # refuses inconsistent settings before the node starts
-    return marker_settings
+    joined()  # refuses inconsistent settings before the node starts
+    return joined
 
 
 __all__ = ['PARAMETERS', 'ExtractionNode', 'main']

@@ -231,9 +231,7 @@ def stalled_streams(state: ReconstructionState) -> Health | None:
 def missing_publishers(state: ReconstructionState) -> Health | None:
     """Warn if nobody publishes the frames of a fluoroscope."""
     published = map(state.node.has_publisher, state.topics)
-    missing = ', '.join(
-        name for name, is_published in zip(state.streams, published) if not is_published
-    )
+    missing = ', '.join(name for name, live in zip(state.streams, published) if not live)
     return warning(missing and f'no publisher of corrected observations of {missing}')
 
 
@@ -376,12 +374,8 @@ def statuses_of(follower: BodyFollower, counts: RecentCounts) -> list[Status]:
     bodies = [BodyState(body, state, row, *untimed) for row, body in enumerate(follower.bodies)]
     return [
         *(
-            Status(
-                f'body {body_state.body.name}',
-                *health_of(body_state, BODY_CONDITIONS),
-                _values(body_state),
-            )
-            for body_state in bodies
+            Status(f'body {body.body.name}', *health_of(body, BODY_CONDITIONS), _values(body))
+            for body in bodies
         ),
         *(
             Status(f'joint {joint.joint.name}', *health_of(joint, JOINT_CONDITIONS))

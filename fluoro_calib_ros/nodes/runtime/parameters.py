@@ -225,12 +225,7 @@ def groups_of(settings: type[Any]) -> dict[str, ParameterGroup[Any]]:
 
 def declare_groups(node: Node, settings: type[T]) -> T:
     """Declare the parameters of a settings dataclass; return their values. Raises StartError."""
-    return settings(
-        **{
-            name: parameter_group.declare(node)
-            for name, parameter_group in groups_of(settings).items()
-        }
-    )
+    return settings(**{name: each.declare(node) for name, each in groups_of(settings).items()})
 
 
 def follow_groups(node: Node, present: Callable[[], T], use: Callable[[T], None]) -> None:
@@ -258,14 +253,12 @@ def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -
     Integers are accepted for floating-point parameters.
     """
     default = declaration.default
-    override = node._parameter_overrides.get(
-        declaration.name
-    )  # rclpy has no public access to them
-    if override is not None:
-        if isinstance(default, float) and override.type_ == Parameter.Type.INTEGER:
-            override = Parameter(declaration.name, value=float(override.value))
-            node._parameter_overrides[declaration.name] = override
-        _check_given(declaration, override)
+    given = node._parameter_overrides.get(declaration.name)  # rclpy has no public access to them
+    if given is not None:
+        if isinstance(default, float) and given.type_ == Parameter.Type.INTEGER:
+            given = Parameter(declaration.name, value=float(given.value))
+            node._parameter_overrides[declaration.name] = given
+        _check_given(declaration, given)
     try:
         value = node.declare_parameter(
             declaration.name,

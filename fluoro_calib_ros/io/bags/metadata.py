@@ -149,8 +149,8 @@ def _earlier_typestore(changes: int) -> Typestore:
     """Return the typestore with the types in ADDED after the first `changes` changes."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _package_texts().items():
-        earlier = name in ADDED and changes < len(ADDED[name])
-        text = earlier_text(name, changes) if earlier else text
+        is_earlier = name in ADDED and changes < len(ADDED[name])
+        text = earlier_text(name, changes) if is_earlier else text
         store.register(get_types_from_msg(text, name))
     return store
 

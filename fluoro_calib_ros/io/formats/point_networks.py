@@ -52,13 +52,13 @@ def read_deeplabcut(path: Path, settings: FileSettings) -> Content:
     with path.open('rb') as file:
         is_hdf5 = file.read(len(HDF5)) == HDF5
     rows = _rows_of_hdf5(path) if is_hdf5 else read_table(path, ',')
-    top = {row.cells[0].lower(): row for row in rows[: len(HEADER)]}
-    header = {name: row for name, row in top.items() if name in HEADER}
-    body = rows[len(header) :]
+    top_rows = {row.cells[0].lower(): row for row in rows[: len(HEADER)]}
+    header = {name: row for name, row in top_rows.items() if name in HEADER}
+    rows_of_frames = rows[len(header) :]
     coords = header.get('coords')
-    if coords is None or 'bodyparts' not in header or not body:
+    if coords is None or 'bodyparts' not in header or not rows_of_frames:
         rows[0].fail('a DeepLabCut table has rows scorer, bodyparts and coords, and then frames')
-    require_width([*header.values(), *body], len(coords.cells), 'the row coords')
+    require_width([*header.values(), *rows_of_frames], len(coords.cells), 'the row coords')
     first = next((k for k, cell in enumerate(coords.cells) if k and cell), len(coords.cells))
     targets = _body_parts(header, first)
     target_id, names = numbered_targets(targets, settings.names.targets)
@@ -67,13 +67,13 @@ def read_deeplabcut(path: Path, settings: FileSettings) -> Content:
     frames: dict[int, Frame] = {}
     likelihood: list[NDArray[np.float64]] = []
     unsure = 0
-    for row in body:
+    for row in rows_of_frames:
         values = np.array(row.numbers_or_nan(first)).reshape(len(targets), -1)
         seen = np.isfinite(values[:, :2]).all(axis=1)
         if values.shape[1] == 3:
-            likely = values[:, 2] >= LIKELIHOOD
-            unsure += np.count_nonzero(seen & ~likely)
-            seen &= likely
+            is_likely = values[:, 2] >= LIKELIHOOD
+            unsure += np.count_nonzero(seen & ~is_likely)
+            seen &= is_likely
         if seen.any():
             number = _frame_number(row, first)
             if number in frames:
@@ -247,8 +247,8 @@ def _nodes(path: Path, arrays: dict[str, np.ndarray]) -> list[str]:
 def _fluoroscope_of_video(path: Path, settings: FileSettings) -> str:
     """Return the fluoroscope of a file <project>.000_<video>.analysis.h5: its video."""
     name = path.name.removesuffix(path.suffix).removesuffix('.analysis')
-    found = _OF_VIDEO.fullmatch(name)
-    return settings.fluoroscope_of(found['video'] if found else name, path)
+    match = _OF_VIDEO.fullmatch(name)
+    return settings.fluoroscope_of(match['video'] if match else name, path)
 
 
 def write_sleap(path: Path, content: Content, settings: FileSettings) -> Written:

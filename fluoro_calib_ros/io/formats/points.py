@@ -130,11 +130,11 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     rotation = matrices[..., :3, :3].copy()
     translation = matrices[..., :3, 3] * mm
     missing = np.isnan(matrices).any(axis=(2, 3))
-    turn = np.where(missing[..., None, None], np.eye(3), rotation)
-    wrong = ~is_rotation(turn, TAKEN_TOLERANCE)
+    known_rotation = np.where(missing[..., None, None], np.eye(3), rotation)
+    is_invalid = ~is_rotation(known_rotation, TAKEN_TOLERANCE)
     first = int(arrays['first'])
-    if wrong.any():
-        row, column = np.argwhere(wrong)[0]
+    if is_invalid.any():
+        row, column = np.argwhere(is_invalid)[0]
         raise DataError(
             f'{path}, frame {first + row}: the matrix of {names[column]} is not a rotation'
         )
@@ -260,17 +260,17 @@ def _is_xmalab3d(sample: Sample) -> bool:
 
 def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
     """Read 3-D points. Raises DataError."""
-    header, body, first = read_frames(path)
-    targets = _targets(header, first)
-    require_width(body, 3 * len(targets) + first, 'the header')
+    header, rows, first_column = read_frames(path)
+    targets = _targets(header, first_column)
+    require_width(rows, 3 * len(targets) + first_column, 'the header')
     mm = settings.unit_read(path)
     target_id, named = numbered_targets(targets, settings.names.targets)
-    frame = frame_numbers(body, first)
-    for before, row, number in zip(frame, body[1:], frame[1:]):
+    frame = frame_numbers(rows, first_column)
+    for before, row, number in zip(frame, rows[1:], frame[1:]):
         if number <= before:
             row.fail(f'frame {number} comes after frame {before}')
-    values = np.array([row.numbers_or_nan(first) for row in body])
-    xyz = from_units(values.reshape(len(body), -1, 3), mm)
+    values = np.array([row.numbers_or_nan(first_column) for row in rows])
+    xyz = from_units(values.reshape(len(rows), -1, 3), mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     points = points_without_precision(np.array(frame), target_id, xyz, settings.rate_hz)
     return Content(points=points, names=named)
@@ -278,14 +278,14 @@ def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
 
 def _targets(row: Row, first: int) -> list[str]:
     """Return the names of the targets in a header. Raises DataError."""
-    found = []
+    names = []
     for cell, axis in zip(row.cells[first:], 'XYZ' * len(row.cells)):
         match = _COLUMN.fullmatch(cell)
         if match is None or match['axis'].upper() != axis:
             row.fail(f'the column {cell!r} is not <name>_{axis}')
-        found.append(match['target'])
-    targets = found[::3]
-    if len(found) % 3 or found != [name for name in targets for _ in 'XYZ']:
+        names.append(match['target'])
+    targets = names[::3]
+    if len(names) % 3 or names != [name for name in targets for _ in 'XYZ']:
         row.fail('the columns are not triples <name>_X,<name>_Y,<name>_Z')
     for name in targets:
         if targets.count(name) > 1:

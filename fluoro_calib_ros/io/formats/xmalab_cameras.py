@@ -230,11 +230,11 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
     ones = np.ones((len(columns), 1))
     projections = np.concatenate([columns, ones], axis=1).reshape(-1, 3, 4)
     downwards = bool((np.linalg.det(projections[:, :, :3]) > 0).all())
-    to_ours = np.linalg.inv(_file_pixels(size, downwards))
+    to_pixels = np.linalg.inv(_file_pixels(size, downwards))
     cameras = []
     for name, projection in zip(names, projections):
         try:
-            cameras.append(_dlt_camera(name, to_ours @ projection, size, mm))
+            cameras.append(_dlt_camera(name, to_pixels @ projection, size, mm))
         except ValueError as error:
             raise DataError(f'{path}, {name}: {error}') from None
     note = f'{path}: rows count downwards, as in DLTdv8, or the origin would be behind the cameras'

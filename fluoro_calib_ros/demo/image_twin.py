@@ -57,12 +57,12 @@ class RecordedRig:
     @classmethod
     def of(cls, bags: Path, names: Sequence[str]) -> RecordedRig:
         """Return the rig of fluoroscopes described by the truth in a folder of bags."""
-        made_with = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
+        settings = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
         return cls(
-            virtual_rig(made_with['seed'], made_with['strength'], names),
-            seed=made_with['seed'],
-            noise_px=made_with['noise'],
-            exposures=made_with['exposures'],
+            virtual_rig(settings['seed'], settings['strength'], names),
+            seed=settings['seed'],
+            noise_px=settings['noise'],
+            exposures=settings['exposures'],
         )
 
 

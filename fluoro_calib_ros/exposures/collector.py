@@ -101,13 +101,13 @@ class ExposureCollector:
         Returns '' if the pair was collected, otherwise the reason. The first frame of a stream is
         collected like a single shot, and discarded if the next ones show that the phantom moves.
         """
-        first = self.fluoroscopes[0]
-        stamp_ns = pair[first].stamp_ns
+        first_name = self.fluoroscopes[0]
+        stamp_ns = pair[first_name].stamp_ns
         still_ns = self.still.still_time_s * 1e9
         self._confirm_single(pair, still_ns)
-        window = [p for p in self._recent if 0 <= stamp_ns - p[first].stamp_ns <= still_ns]
+        window = [p for p in self._recent if 0 <= stamp_ns - p[first_name].stamp_ns <= still_ns]
         max_displacement = max((self._displacement(pair, p) for p in window), default=0.0)
-        span = max((stamp_ns - p[first].stamp_ns for p in window), default=0)
+        span = max((stamp_ns - p[first_name].stamp_ns for p in window), default=0)
         self._update_streaming(stamp_ns, bool(window), still_ns)
         self._recent.append(pair)
         if max_displacement > self.still.still_px:
@@ -123,15 +123,15 @@ class ExposureCollector:
 
     def _confirm_single(self, pair: Pair, still_ns: float) -> None:
         """Discard the single shot if the next frames show that the phantom moved."""
-        single = self._single
-        if single is None:
+        single_shot = self._single
+        if single_shot is None:
             return
-        first = self.fluoroscopes[0]
-        if not 0 <= pair[first].stamp_ns - single[first].stamp_ns <= still_ns:
+        first_name = self.fluoroscopes[0]
+        if not 0 <= pair[first_name].stamp_ns - single_shot[first_name].stamp_ns <= still_ns:
             self._single = None
-        elif self._displacement(pair, single) > self.still.still_px:
+        elif self._displacement(pair, single_shot) > self.still.still_px:
             self._single = None
-            self._discard(single)
+            self._discard(single_shot)
 
     def _discard(self, pair: Pair) -> None:
         """Remove an exposure."""
@@ -150,10 +150,10 @@ class ExposureCollector:
         A stream begins with the first frame that follows another one in time, and ends with a long
         gap.
         """
-        before = self._recent[-1][self.fluoroscopes[0]].stamp_ns if self._recent else None
+        previous_ns = self._recent[-1][self.fluoroscopes[0]].stamp_ns if self._recent else None
         if follows:
             self._streaming = True
-        elif before is None or not 0 <= now - before <= MAX_GAP * still_ns:
+        elif previous_ns is None or not 0 <= now - previous_ns <= MAX_GAP * still_ns:
             self._streaming = False
 
     def add(self, pair: Pair) -> str:
@@ -268,11 +268,11 @@ def collect_recorded(
     unpaired : dict of str to int
         Number of frames without a partner, by fluoroscope.
     """
-    still = StillOptions()
+    still_options = StillOptions()
     pairer = CompletePairer(frames, RecordedPairing(pair_by, tolerance_s).unlimited())
-    collector = ExposureCollector(frames, still)
+    collector = ExposureCollector(frames, still_options)
     if mode == 'auto':
-        mode = 'still' if any(_is_stream(f, still) for f in frames.values()) else 'all'
+        mode = 'still' if any(_is_stream(f, still_options) for f in frames.values()) else 'all'
     collect = collector.offer if mode == 'still' else collector.add
     recorded = [frame for view_frames in frames.values() for frame in view_frames]
     for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
@@ -321,8 +321,8 @@ def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
     count = f'{remaining} more, ' if remaining > 0 else ''
     if not areas:
         return Readiness(False, f'{count}with the phantom turned and tilted')
-    where = ' and '.join(AREAS[area] for area in areas)
-    return Readiness(False, f'{count}with beads {where} of the image', areas)
+    areas_text = ' and '.join(AREAS[area] for area in areas)
+    return Readiness(False, f'{count}with beads {areas_text} of the image', areas)
 
 
 # Coverage of the image by the collected image points.
@@ -518,9 +518,9 @@ class _Table:
 
 def _joined(frames: Sequence[Frame], number: int) -> Frame:
     """Return a frame with the median image points of frames, which is the mean for two."""
-    first = frames[0]
+    first_frame = frames[0]
     if len(frames) == 1:
-        return first if first.number == number else replace(first, number=number)
+        return first_frame if first_frame.number == number else replace(first_frame, number=number)
     ids = np.unique(np.concatenate([frame.target_id for frame in frames]))
     values = np.full((len(frames), len(ids), 3), np.nan)
     for frame_values, frame in zip(values, frames):
@@ -532,4 +532,4 @@ def _joined(frames: Sequence[Frame], number: int) -> Frame:
     if all(frame.sigma is not None for frame in frames):
         sigma = np.nanmedian(values[..., 2], axis=0)
     uv = np.nanmedian(values[..., :2], axis=0)
-    return replace(first, number=number, target_id=ids, uv=uv, sigma=sigma)
+    return replace(first_frame, number=number, target_id=ids, uv=uv, sigma=sigma)

@@ -116,7 +116,7 @@ def _missing(frames: Frames, decision: PointDecision) -> str:
     if name not in frames:
         return f'there is no fluoroscope {name!r}, only {", ".join(frames)}'
     span = range(decision.first, decision.last + 1)
-    where = f'{span[0]} to {span[-1]}' if len(span) > 1 else f'{span[0]}'
+    range_text = f'{span[0]} to {span[-1]}' if len(span) > 1 else f'{span[0]}'
     if not any(frame.number in span for frame in frames[name]):
-        return f'fluoroscope {name} has no exposure {where}'
-    return f'exposure {where} of fluoroscope {name} has no target {decision.target_id}'
+        return f'fluoroscope {name} has no exposure {range_text}'
+    return f'exposure {range_text} of fluoroscope {name} has no target {decision.target_id}'

@@ -79,8 +79,8 @@ def number_names(names: Iterable[str], known: Mapping[str, int] | None = None) -
     used_numbers = set(known.values())
     ids = _common_numbers(new_names)
     if ids is None or used_numbers & set(ids):
-        first = max(used_numbers, default=0) + 1
-        ids = list(range(first, first + len(new_names)))
+        first_number = max(used_numbers, default=0) + 1
+        ids = list(range(first_number, first_number + len(new_names)))
     return {**known, **dict(zip(new_names, ids))}
 
 

@@ -398,8 +398,8 @@ class PartialPairer(_Counts):
         """Stop waiting and start anew; return the exposures that were waiting."""
         ready: list[Exposure] = []
         while any(self._queues.values()):
-            first = min(queue[0][0] for queue in self._queues.values() if queue)
-            end = first + self._tolerance
+            first_key = min(queue[0][0] for queue in self._queues.values() if queue)
+            end = first_key + self._tolerance
             names = [name for name, queue in self._queues.items() if queue and queue[0][0] <= end]
             ready += self._pop_exposure(names, end)
         self._start()

@@ -130,8 +130,8 @@ def encoding_of(content: bytes) -> str:
 
 def kind_not_read(content: bytes) -> str:
     """Return the kind of a file that is not read, with advice to the user; otherwise ''."""
-    begin = content.lstrip()
-    return next((kind for start, kind in _NOT_READ if begin.startswith(start)), '')
+    stripped = content.lstrip()
+    return next((kind for start, kind in _NOT_READ if stripped.startswith(start)), '')
 
 
 def check_rows(text: str, most: int, where: object) -> None:

@@ -161,9 +161,10 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
         )
     if not 1 <= version <= layout.version:
         last = layout.version
-        known = 'version 1' if last == 1 else f'versions 1 to {last}'
+        known_versions = 'version 1' if last == 1 else f'versions 1 to {last}'
         raise DataError(
-            f'{path}: the file has layout version {int(version)}, this program knows {known}'
+            f'{path}: the file has layout version {int(version)}, this program knows '
+            f'{known_versions}'
         )
     return int(version)
 

@@ -250,8 +250,8 @@ def _present_ids(path: PathLike, orientation: RigOrientation) -> tuple[str, ...]
         calibration_file = calibration_path(folder, name)
         if os.path.isfile(calibration_file):
             with suppress(DataError):  # reported where the calibration is used
-                calibration, stored = read_with_id(calibration_file)
-                present_id = calibration.calibration_id if stored == identity else identity
+                calibration, stored_id = read_with_id(calibration_file)
+                present_id = calibration.calibration_id if stored_id == identity else identity
         present_ids.append(present_id)
     return tuple(present_ids)
 
@@ -311,8 +311,8 @@ def used_exposures(document: Mapping[str, Any], frames: Frames) -> dict[str, set
         entry = entries.get(name) if isinstance(entries, Mapping) else None
         rows = entry.get('exposures') if isinstance(entry, Mapping) else None
         if isinstance(rows, list):
-            used = {row.get('exposure') for row in rows if isinstance(row, Mapping)}
-            numbers_by_name[name] = numbers & used or numbers
+            used_numbers = {row.get('exposure') for row in rows if isinstance(row, Mapping)}
+            numbers_by_name[name] = numbers & used_numbers or numbers
     return numbers_by_name
 
 
@@ -392,8 +392,8 @@ def exchanged(
     mismatched = []
     for name, calibration in calibrations.items():
         entry = entries.get(name)
-        stated = entry.get('calibration_id') if isinstance(entry, Mapping) else None
-        if stated is not None and stated != calibration.calibration_id:
+        stated_id = entry.get('calibration_id') if isinstance(entry, Mapping) else None
+        if stated_id is not None and stated_id != calibration.calibration_id:
             mismatched.append(name)
     if not mismatched:
         return None

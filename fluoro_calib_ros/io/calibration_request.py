@@ -100,12 +100,12 @@ def read_request(
                 f'{where}: these are not the observations and the phantom from which the '
                 f'calibration of fluoroscope {name} was made'
             )
-    used = {name: frames[name] for name in calibrations}
+    calibrated_frames = {name: frames[name] for name in calibrations}
     names = read_names(directory)
     path = directory / KNOWN_ORIENTATION
     known_orientations = read_known_orientations(path) if path.exists() else {}
     return CalibrationRequest(
-        used,
+        calibrated_frames,
         phantom,
         options=options,
         joint=joint,

@@ -102,10 +102,10 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
     text = read_text(path)
     check_rows(text, MAX_ROWS_CSV, path)
     rows = _numbered_rows(path, text)
-    line, first = next(rows, (0, []))
-    if not first:
+    line, first_row = next(rows, (0, []))
+    if not first_row:
         raise DataError(f'{path}: the file has no header, {",".join(required)} is expected')
-    header = [name.strip() for name in first]
+    header = [name.strip() for name in first_row]
     _check_header(f'{path}, row {line}', header, required)
     is_empty = True
     while block := list(islice(rows, BLOCK)):

@@ -44,8 +44,8 @@ def read_image_angles(path: PathLike) -> dict[int, float]:
         numbers = block.ids('image')
         block.require('image', numbers > 0, 'the first image is 1')
         degrees = block.floats_or_nan('angle_deg')
-        possible = np.isnan(degrees) | (np.abs(degrees) <= np.degrees(MAX_ANGLE))
-        block.require('angle_deg', possible, 'not an angle')
+        valid = np.isnan(degrees) | (np.abs(degrees) <= np.degrees(MAX_ANGLE))
+        block.require('angle_deg', valid, 'not an angle')
         for index, (number, angle) in enumerate(zip(numbers.tolist(), np.radians(degrees))):
             if number in rows:
                 block.fail(index, f'image {number} is in row {rows[number]}, too')
@@ -106,10 +106,10 @@ def image_suffix_of(path: PathLike) -> str:
         return ''
     try:
         with open(path, 'rb') as file:
-            begin = file.read(132)
+            head = file.read(132)
     except OSError:
         return ''
-    return next((s for at, mark, s in _BEGINNINGS if begin[at:].startswith(mark)), '')
+    return next((s for at, mark, s in _BEGINNINGS if head[at:].startswith(mark)), '')
 
 
 def is_image_source(path: PathLike) -> bool:

@@ -57,12 +57,12 @@ def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
     if suffix in STACK_SUFFIXES:
         return _write_stack(out, source, progress)
     if source.kind != 'image':
-        possible: tuple[str, ...] = STACK_SUFFIXES
+        suffixes: tuple[str, ...] = STACK_SUFFIXES
         if source.kind == 'video':
-            possible = (*STACK_SUFFIXES, *VIDEO_CODECS)
+            suffixes = (*STACK_SUFFIXES, *VIDEO_CODECS)
         raise DataError(
             f'{out}: a {source.kind} cannot be written as {suffix or "a file without ending"}, '
-            f'use {listed(possible)}'
+            f'use {listed(suffixes)}'
         )
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(

@@ -152,10 +152,10 @@ def _on_image(
     is_off = ~points_on_image(rows.uv, image_size)
     if not is_off.any():
         return rows, ''
-    first = int(np.argmax(is_off))
-    u, v = rows.uv[first]
+    row = int(np.argmax(is_off))
+    u, v = rows.uv[row]
     sentence = (
-        f'{path}, row {rows.line[first]}: the point ({u:g}, {v:g}) is off the image of '
+        f'{path}, row {rows.line[row]}: the point ({u:g}, {v:g}) is off the image of '
         f'{image_size[0]} x {image_size[1]} px'
     )
     if not leave_out or not few(int(is_off.sum()), len(is_off)):
@@ -527,12 +527,12 @@ def correct_points(
                 f'of {", ".join(calibrations)}'
             )
         names = np.array([*calibrations] * len(points.uv))
-    unknown = np.flatnonzero(~np.isin(names, list(calibrations)))
-    if len(unknown):
-        first = unknown[0]
+    without_calibration = np.flatnonzero(~np.isin(names, list(calibrations)))
+    if len(without_calibration):
+        first_row = without_calibration[0]
         raise DataError(
-            f'{points.path}, row {points.lines[first]}: there is no calibration of fluoroscope '
-            f'{str(names[first])!r}, only of {", ".join(calibrations)}'
+            f'{points.path}, row {points.lines[first_row]}: there is no calibration of '
+            f'fluoroscope {str(names[first_row])!r}, only of {", ".join(calibrations)}'
         )
     corrected = CorrectedPoints(
         np.full(points.uv.shape, np.nan),

@@ -267,8 +267,8 @@ def _cine_header(file: BinaryIO, size: int) -> CineHeader:
         offsets=offsets,
         frame_rate=rate,
     )
-    needed = ANNOTATION + header.image_bytes
-    valid = (offsets >= FILE_HEADER.size) & (offsets <= size - needed)
+    bytes_needed = ANNOTATION + header.image_bytes
+    valid = (offsets >= FILE_HEADER.size) & (offsets <= size - bytes_needed)
     if not valid.all():
         raise DataError(
             f'the cine file is damaged or cut off: only {int(valid.sum())} of {count} images are '

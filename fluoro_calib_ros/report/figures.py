@@ -134,8 +134,8 @@ def phantom_figure(drawing: Drawing) -> Figure:
 def _draw_layer(axes: matplotlib.axes.Axes, drawing: Drawing, layer: int, radius: float) -> None:
     count = drawing.rows * drawing.columns
     blocked = set(drawing.blocked_id.tolist())
-    for place, (x, y, _) in enumerate(drawing.places_mm[layer * count : (layer + 1) * count]):
-        number = layer * count + place + 1
+    for index, (x, y, _) in enumerate(drawing.places_mm[layer * count : (layer + 1) * count]):
+        number = layer * count + index + 1
         is_blocked = number in blocked
         if is_blocked:
             axes.plot([x], [y], marker='x', color=RED, markersize=12, markeredgewidth=2)
@@ -325,7 +325,7 @@ ARROWS = 16  # number of arrows along the longer side of the image
 
 def comparison_document(comparison: Comparison, mm_per_px: float | None) -> dict[str, Any]:
     """Return a Comparison as a dict; mm_per_px is the scale at the phantom."""
-    largest, place = comparison.largest
+    largest, location = comparison.largest
     scale = float('nan') if mm_per_px is None else mm_per_px
     return {
         'interior_px': comparison.interior,
@@ -335,7 +335,7 @@ def comparison_document(comparison: Comparison, mm_per_px: float | None) -> dict
         'rms_mm': comparison.rms_px * scale,
         'largest_px': largest,
         'largest_mm': largest * scale,
-        'largest_at': list(place),
+        'largest_at': list(location),
         'share_significant': float(comparison.significant.mean()),
         'field_changed': comparison.field_changed,
     }

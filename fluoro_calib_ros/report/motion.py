@@ -164,8 +164,8 @@ def _draw_paths(axes: Axes, xyz: NDArray[np.float64]) -> None:
     """Draw the paths of points (T, n, 3), with a dot at the end of each."""
     for path in np.swapaxes(xyz, 0, 1):
         (line,) = axes.plot(*path.T, linewidth=1)
-        last = path[np.isfinite(path[:, 0])][-1:]
-        axes.scatter(*last.T, s=12, color=line.get_color())
+        last_point = path[np.isfinite(path[:, 0])][-1:]
+        axes.scatter(*last_point.T, s=12, color=line.get_color())
     axes.set(xlabel='x [mm]', ylabel='y [mm]', zlabel='z [mm]', title='paths in space')
     axes.zaxis.labelpad = 10
     if np.isfinite(xyz).any():

@@ -52,8 +52,8 @@ def relative_costs(
     F has the same unit in all rounds.
     """
     before = run.before
-    first = float(np.sum(before.noise.weight(before.q)[:, None] * before.residuals**2))
-    f = np.array([first] + [r.quadratic for r in run.history])
+    initial = float(np.sum(before.noise.weight(before.q)[:, None] * before.residuals**2))
+    f = np.array([initial] + [r.quadratic for r in run.history])
     recorded = np.array([r.G for r in run.history])
     g = recorded * f[:-1]
     return 100 * f / f[0], 100 * g / g[0], 100 * recorded / recorded[0]

@@ -50,7 +50,7 @@ def accuracy_in_space(
     sd = []
     measured = []
     surveyed = []
-    expected = []
+    variances = []
     for frame in frames:
         row = phantom.index(frame.target_id)
         ok = (frame.points.status == OK) & (row >= 0)
@@ -64,7 +64,7 @@ def accuracy_in_space(
         measured.append(length)
         survey_xyz = phantom.xyz_mm[row]
         surveyed.append(np.linalg.norm(survey_xyz[second] - survey_xyz[first], axis=1))
-        expected.append(
+        variances.append(
             np.einsum('ni,nij,nj->n', unit, covariance, unit)
             + phantom.sd_mm[row[first]] ** 2
             + phantom.sd_mm[row[second]] ** 2
@@ -81,7 +81,7 @@ def accuracy_in_space(
         distances=len(lengths),
         distance_mm=float(lengths.mean()),
         distance_rms_mm=float(np.sqrt(np.mean(difference**2))),
-        distance_sd_mm=float(np.sqrt(np.mean(np.concatenate(expected)))),
+        distance_sd_mm=float(np.sqrt(np.mean(np.concatenate(variances)))),
     )
 
 

@@ -138,9 +138,9 @@ def walking(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
     waves = np.cos(np.outer(phase, order)) @ GAIT_COS_DEG
     flexion = np.deg2rad(waves + np.sin(np.outer(phase, order[1:])) @ GAIT_SIN_DEG)
     swing = np.deg2rad(20) * np.cos(phase)
-    zero = np.zeros_like(phase)
-    rotation = matrix_from_vector(np.column_stack([swing, zero, zero])) @ matrix_from_vector(
-        np.deg2rad(3) * np.column_stack([zero, np.sin(phase), np.sin(phase + 1)])
+    zeros = np.zeros_like(phase)
+    rotation = matrix_from_vector(np.column_stack([swing, zeros, zeros])) @ matrix_from_vector(
+        np.deg2rad(3) * np.column_stack([zeros, np.sin(phase), np.sin(phase + 1)])
     )
     centre = np.column_stack(
         [
@@ -161,13 +161,13 @@ def landing(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
     """
     speed = np.sqrt(2 * GRAVITY * DROP_MM)
     t = np.maximum(times_s - FALL_S, 0.0)
-    before = np.minimum(times_s - FALL_S, 0.0)
+    before_contact = np.minimum(times_s - FALL_S, 0.0)
     s = t / RISE_S
-    height = -speed * before - GRAVITY / 2 * before**2
+    height = -speed * before_contact - GRAVITY / 2 * before_contact**2
     height -= speed * RISE_S * (2 - (2 + s) * np.exp(-s))
     bend = 1 - (1 + t / FLEX_S) * np.exp(-t / FLEX_S)
     tilt = np.deg2rad(4 + 18 * bend)
-    zero = np.zeros_like(t)
+    zeros = np.zeros_like(t)
     rotation = matrix_from_vector(np.column_stack([-tilt, 0.05 * bend, 0.04 * bend]))
     start = np.deg2rad(4)
     centre = np.column_stack(
@@ -178,7 +178,7 @@ def landing(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
         ]
     )
     flexion = np.deg2rad(15 + 50 * bend)
-    angles, translations = _coupled(flexion, zero)
+    angles, translations = _coupled(flexion, zeros)
     return _motion(knee, times_s, (rotation, centre), angles, translations, of_tibia=True)
 
 

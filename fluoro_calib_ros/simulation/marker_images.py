@@ -141,12 +141,12 @@ def _spread(rng: np.random.Generator, scene: MarkerScene) -> NDArray[np.float64]
     """Return markers (n, 3) of all clusters [mm], none of them close to another of its cluster."""
     positions = []
     for _ in range(scene.clusters):
-        chosen: list[NDArray[np.float64]] = []
-        while len(chosen) < scene.markers:
+        cluster: list[NDArray[np.float64]] = []
+        while len(cluster) < scene.markers:
             point = rng.uniform(-1, 1, 3) * scene.spread_mm * np.array([0.5, 0.5, 1.0])
-            if all(np.linalg.norm(point - other) > 0.25 * scene.spread_mm for other in chosen):
-                chosen.append(point)
-        positions += chosen
+            if all(np.linalg.norm(point - other) > 0.25 * scene.spread_mm for other in cluster):
+                cluster.append(point)
+        positions += cluster
     return np.array(positions)
 
 
@@ -318,8 +318,8 @@ class MarkerRadiography(Radiography):
         if settings.noise_blur_px:
             noise = cv2.GaussianBlur(noise, (0, 0), settings.noise_blur_px)
         largest = 2**settings.bits - 1
-        counted = (expected + noise) / settings.photons
-        grey = largest * (DARK + (OPEN_BEAM - DARK) * counted)
+        signal = (expected + noise) / settings.photons
+        grey = largest * (DARK + (OPEN_BEAM - DARK) * signal)
         if settings.inverted:
             grey = largest - grey
         dtype = np.uint8 if settings.bits == 8 else np.uint16

@@ -167,7 +167,7 @@ class Radiography:
         # Exclude shadows that do not touch the image; cut the others at its edge.
         seen = np.flatnonzero(((low < (width, height)) & (low + count > 0)).all(axis=1))
         detector = self._patches_mm(low[seen], count)
-        total = np.zeros((height, width), dtype=np.float32)
+        total_transmission = np.zeros((height, width), dtype=np.float32)
         spots = focal_spot(self.settings.focal_spot_mm)
         for spot in spots:
             transmission = np.ones(
@@ -181,8 +181,8 @@ class Radiography:
             inner = transmission[
                 count * factor : -count * factor, count * factor : -count * factor
             ]
-            total += cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA)
-        return total / len(spots)
+            total_transmission += cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA)
+        return total_transmission / len(spots)
 
     def _patches_mm(self, low: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Return points (n, k, 3) of the detector [mm] where rays meet patches of `count` pixels.
@@ -340,14 +340,14 @@ def _digitised(
 ) -> np.ndarray:
     """Return grey values (h, w) of light from 0 to 1, with quantum noise."""
     expected = np.maximum(light, 0) * settings.photons
-    counted = rng.poisson(expected).astype(np.float32)
+    counts = rng.poisson(expected).astype(np.float32)
     if settings.noise_blur_px:
         noise = cv2.GaussianBlur(
-            (counted - expected).astype(np.float32), (0, 0), settings.noise_blur_px
+            (counts - expected).astype(np.float32), (0, 0), settings.noise_blur_px
         )
-        counted = expected + noise
+        counts = expected + noise
     largest = 2**settings.bits - 1
-    grey = largest * (DARK + (OPEN_BEAM - DARK) * counted / settings.photons)
+    grey = largest * (DARK + (OPEN_BEAM - DARK) * counts / settings.photons)
     if settings.inverted:
         grey = largest - grey
     dtype = np.uint8 if settings.bits == 8 else np.uint16

@@ -199,8 +199,8 @@ def _complete_summary(file: BinaryIO) -> Summary | None:
         return None
     if not summary.channels and (summary.statistics is None or summary.statistics.channel_count):
         return None
-    used = {channel.schema_id for channel in summary.channels.values()} - {0}
-    return summary if used <= set(summary.schemas) else None
+    used_ids = {channel.schema_id for channel in summary.channels.values()} - {0}
+    return summary if used_ids <= set(summary.schemas) else None
 
 
 def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Iterator[BagMessage]:
@@ -223,7 +223,7 @@ def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Itera
 def _scan(file: BinaryIO) -> _Scan:
     """Read all records of a file to collect its channels and message counts."""
     scan = _Scan()
-    last = 0
+    last_ns = 0
     for record in _records(file):
         if isinstance(record, Schema):
             scan.schemas[record.id] = record
@@ -231,8 +231,8 @@ def _scan(file: BinaryIO) -> _Scan:
             scan.channels[record.id] = record
         elif isinstance(record, Message):
             scan.counts[record.channel_id] = scan.counts.get(record.channel_id, 0) + 1
-            scan.ordered = scan.ordered and record.log_time >= last
-            last = record.log_time
+            scan.ordered = scan.ordered and record.log_time >= last_ns
+            last_ns = record.log_time
     return scan
 
 

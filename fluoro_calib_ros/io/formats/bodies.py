@@ -188,8 +188,8 @@ def _read_poses(path: Path, settings: FileSettings) -> Content:
         rows.require(name, ~np.isinf(column), 'not a finite number')
     names = list(dict.fromkeys(body.tolist()))
     frames, row = np.unique(frame, return_inverse=True)
-    place = np.array([names.index(name) for name in body.tolist()])
-    repeated = first_repeated(row * len(names) + place)
+    body_index = np.array([names.index(name) for name in body.tolist()])
+    repeated = first_repeated(row * len(names) + body_index)
     if repeated is not None:
         first, second = repeated
         rows.fail(
@@ -204,7 +204,7 @@ def _read_poses(path: Path, settings: FileSettings) -> Content:
     shape = (len(frames), len(names), 3)
     translation = np.full(shape, np.nan)
     rotation = np.full((*shape, 3), np.nan)
-    index = row[known], place[known]
+    index = row[known], body_index[known]
     translation[index] = values[known, :3]
     rotation[index] = matrix_from_quaternion(values[known][:, [6, 3, 4, 5]])
     rate = rate_of(frame, seconds * 1e9)

@@ -92,22 +92,22 @@ def _rows(path: Path, width: int) -> list[Row]:
 
 def _cameras(rows: Mapping[str, Sequence[Row]], settings: FileSettings) -> _Cameras:
     """Return the cameras listed in .eop and .iop, or a single one if neither exists."""
-    of_station = {
+    camera_of_station = {
         row.whole(0, 'the station'): row.whole(1, 'the camera') for row in rows.get('.eop', ())
     }
     numbers = sorted({row.whole(0, 'the camera') for row in rows.get('.iop', ())})
-    numbers = sorted(set(numbers) | set(of_station.values())) or [1]
-    if not of_station and '.pho' in rows:
+    numbers = sorted(set(numbers) | set(camera_of_station.values())) or [1]
+    if not camera_of_station and '.pho' in rows:
         if len(numbers) > 1:
             raise DataError(
                 f'{rows[".pho"][0].path}: there are {len(numbers)} cameras, and without the .eop '
                 'file nothing says which station belongs to which'
             )
-        of_station = {row.whole(1, 'the station'): numbers[0] for row in rows['.pho']}
+        camera_of_station = {row.whole(1, 'the station'): numbers[0] for row in rows['.pho']}
     names = {number: f'cam{number}' for number in numbers}
     if len(settings.fluoroscopes) == len(numbers):
         names = dict(zip(numbers, settings.fluoroscopes))
-    return _Cameras(names, of_station, _exposures(of_station))
+    return _Cameras(names, camera_of_station, _exposures(camera_of_station))
 
 
 def _exposures(of_station: Mapping[int, int]) -> dict[int, int]:

@@ -141,14 +141,14 @@ def _write_points(path: Path, content: Content, settings: FileSettings) -> Writt
 def _point_rows(
     points: Points, rate: float | None, named: Mapping[int, str]
 ) -> Iterator[list[object]]:
-    first = int(points.frame[0])
+    first_frame = int(points.frame[0])
     for row, column in np.argwhere(~np.isnan(points.xyz_mm[..., 0])).tolist():
         number = int(points.frame[row])
         target = int(points.target_id[column])
         cells = {
             **dict.fromkeys(POINTS, ''),
             'frame': number,
-            'stamp_ns': '' if rate is None else round((number - first) / rate * 1e9),
+            'stamp_ns': '' if rate is None else round((number - first_frame) / rate * 1e9),
             'target_id': target,
             **dict(zip('xyz', points.xyz_mm[row, column].tolist())),
             'residual': float(points.residual_px[row, column]),

@@ -100,8 +100,8 @@ def literal(pickled: bytes) -> Any:
         elif name in _VALUES:
             stack.append(argument)
         elif name in _MAKERS:
-            begin = len(stack) - 1 - stack[::-1].index(_MARK)
-            stack[begin:] = [_MAKERS[name](stack[begin + 1 :])]
+            mark_index = len(stack) - 1 - stack[::-1].index(_MARK)
+            stack[mark_index:] = [_MAKERS[name](stack[mark_index + 1 :])]
         elif name == 'APPEND':
             value = stack.pop()
             stack[-1].append(value)

@@ -98,8 +98,8 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
 
 def _separator(lines: Sequence[str]) -> str:
     """Return the separator found in the second row, ' ' for blanks."""
-    first = lines[1] if len(lines) > 1 else ''.join(lines)
-    return next((mark for mark in ';\t,' if mark in first), ' ')
+    sample_line = lines[1] if len(lines) > 1 else ''.join(lines)
+    return next((mark for mark in ';\t,' if mark in sample_line), ' ')
 
 
 def _cells(line: str, separator: str) -> list[str]:

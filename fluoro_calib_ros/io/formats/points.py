@@ -103,7 +103,7 @@ def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     names = names[: xyz.shape[1]]
     if len(set(names)) < xyz.shape[1]:
         raise DataError(f'{path}: {xyz.shape[1]} points, but {len(set(names))} different names')
-    target_id, named = numbered_targets(names, settings.names.targets)
+    target_id, content_names = numbered_targets(names, settings.names.targets)
     xyz = np.where((residual < 0)[..., None], np.nan, xyz * mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     sd = np.where(residual > 0, residual * mm, np.nan)
@@ -115,7 +115,7 @@ def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
         residual_px=np.full(sd.shape, np.nan),
         rate_hz=float(arrays['rate']),
     )
-    return Content(points=points, names=named)
+    return Content(points=points, names=content_names)
 
 
 def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -> Bodies:
@@ -132,17 +132,17 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     missing = np.isnan(matrices).any(axis=(2, 3))
     known_rotation = np.where(missing[..., None, None], np.eye(3), rotation)
     is_invalid = ~is_rotation(known_rotation, TAKEN_TOLERANCE)
-    first = int(arrays['first'])
+    first_frame = int(arrays['first'])
     if is_invalid.any():
         row, column = np.argwhere(is_invalid)[0]
         raise DataError(
-            f'{path}, frame {first + row}: the matrix of {names[column]} is not a rotation'
+            f'{path}, frame {first_frame + row}: the matrix of {names[column]} is not a rotation'
         )
     rotation[missing] = np.nan
     translation[missing] = np.nan
     return Bodies(
         tuple(names),
-        first + np.arange(len(matrices)),
+        first_frame + np.arange(len(matrices)),
         rotation,
         translation,
         rate_hz=float(arrays['rotation_rate']),
@@ -207,11 +207,11 @@ def _add_points(file: Any, points: Points, mm: float) -> None:
     """Add points of all frames to a file, in a unit of `mm` millimetres, with their residuals."""
     missing = np.asarray(np.isnan(points.xyz_mm).any(axis=2))
     xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
-    with_one = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
+    homogeneous_xyz = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
     sd = np.nan_to_num(points.sd_mm / mm)
     step = max(float(sd.max(initial=0.0)) / 255, 1e-6)
     file['parameters']['POINT']['SCALE']['value'] = [-step]
-    file['data']['points'] = with_one.transpose(2, 1, 0)
+    file['data']['points'] = homogeneous_xyz.transpose(2, 1, 0)
     file['data']['meta_points']['residuals'] = np.where(missing, -1.0, sd).T[None]
 
 
@@ -264,16 +264,16 @@ def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
     targets = _targets(header, first_column)
     require_width(rows, 3 * len(targets) + first_column, 'the header')
     mm = settings.unit_read(path)
-    target_id, named = numbered_targets(targets, settings.names.targets)
+    target_id, content_names = numbered_targets(targets, settings.names.targets)
     frame = frame_numbers(rows, first_column)
-    for before, row, number in zip(frame, rows[1:], frame[1:]):
-        if number <= before:
-            row.fail(f'frame {number} comes after frame {before}')
+    for previous, row, number in zip(frame, rows[1:], frame[1:]):
+        if number <= previous:
+            row.fail(f'frame {number} comes after frame {previous}')
     values = np.array([row.numbers_or_nan(first_column) for row in rows])
     xyz = from_units(values.reshape(len(rows), -1, 3), mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     points = points_without_precision(np.array(frame), target_id, xyz, settings.rate_hz)
-    return Content(points=points, names=named)
+    return Content(points=points, names=content_names)
 
 
 def _targets(row: Row, first: int) -> list[str]:
@@ -358,10 +358,11 @@ def _read_trc(path: Path, settings: FileSettings) -> Content:
             xyz.append(_coordinates(row, count))
     if not frame:
         raise DataError(f'{path}: the file has no frames')
-    target_id, named = numbered_targets(names, settings.names.targets)
+    target_id, content_names = numbered_targets(names, settings.names.targets)
     xyz_mm = from_units(np.array(xyz), mm)
     return Content(
-        points=points_without_precision(np.array(frame), target_id, xyz_mm, rate), names=named
+        points=points_without_precision(np.array(frame), target_id, xyz_mm, rate),
+        names=content_names,
     )
 
 
@@ -386,8 +387,8 @@ def _write_trc(path: Path, content: Content, settings: FileSettings) -> Written:
     names = labels(content)
     rate = number_text(points.rate_hz or math.nan)
     frames = str(len(points.frame))
-    first = int(points.frame[0])
-    values = [rate, rate, frames, str(len(names)), unit, rate, str(first), frames]
+    first_frame = int(points.frame[0])
+    values = [rate, rate, frames, str(len(names)), unit, rate, str(first_frame), frames]
     axes = [f'{axis}{number}' for number in range(1, len(names) + 1) for axis in 'XYZ']
     with atomic_file(path, 'w') as file:
         file.write(f'PathFileType\t4\t(X/Y/Z)\t{path.name}\n')
@@ -395,7 +396,7 @@ def _write_trc(path: Path, content: Content, settings: FileSettings) -> Written:
         file.write('Frame#\tTime\t' + '\t\t\t'.join(names) + '\t\t\n')
         file.write('\t\t' + '\t'.join(axes) + '\n\n')
         for number, xyz in zip(points.frame.tolist(), in_units(points.xyz_mm, UNITS_MM[unit])):
-            time = (number - first) / points.rate_hz
+            time = (number - first_frame) / points.rate_hz
             file.write(f'{number}\t{time!r}\t{joined(xyz.ravel(), TAB)}\n')
     return Written((str(path),), (f'{path}: TRC has no residuals',))
 

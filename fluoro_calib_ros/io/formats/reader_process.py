@@ -82,7 +82,7 @@ def _residuals(path: str, xyz: NDArray[np.float64], scale: float) -> NDArray[np.
     which is the camera mask.
     """
     content = Path(path).read_bytes()
-    analog, data = (int.from_bytes(content[place : place + 2], 'little') for place in (4, 16))
+    analog, data = (int.from_bytes(content[offset : offset + 2], 'little') for offset in (4, 16))
     frames, points, _ = xyz.shape
     width = 4 * points + analog
     kind = '<f4' if scale < 0 else '<i2'

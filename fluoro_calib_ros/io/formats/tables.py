@@ -140,8 +140,8 @@ def table_of(path: PathLike, text: str, separator: str | None = None) -> list[Ro
 
 def separator_of(text: str) -> str:
     """Return the separator found in the first row that is not blank."""
-    first = next((line for line in text.splitlines() if line.strip()), '')
-    return next((mark for mark in ';\t' if mark in first), ',')
+    first_line = next((line for line in text.splitlines() if line.strip()), '')
+    return next((mark for mark in ';\t' if mark in first_line), ',')
 
 
 def _separated(path: PathLike, text: str, separator: str) -> list[Row]:
@@ -275,11 +275,13 @@ def frames_of(
     rate = next((rate for rate in rates if rate), None if needs_rate else math.nan)
     if rate is None:
         raise DataError(f'{path}: the source does not contain the frame rate, --rate HZ is needed')
-    first = min(int(part.frame[0]) for part in parts)
-    count = max(int(part.frame[-1]) for part in parts) - first + 1
+    first_frame = min(int(part.frame[0]) for part in parts)
+    count = max(int(part.frame[-1]) for part in parts) - first_frame + 1
     if count > MAX_ROWS:
-        raise DataError(f'{path}: frames {first} to {first + count - 1} are too many to write')
-    return Frames(first, count, float(rate))
+        raise DataError(
+            f'{path}: frames {first_frame} to {first_frame + count - 1} are too many to write'
+        )
+    return Frames(first_frame, count, float(rate))
 
 
 def points_of(points: Points, frames: Frames) -> Points:

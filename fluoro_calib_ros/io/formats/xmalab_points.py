@@ -74,10 +74,10 @@ def _origin_notes(path: Path, header: Row, settings: FileSettings) -> tuple[str,
     """Return advice about the pixel origin if the column names suggest another program."""
     if settings.one_based or settings.y_up:
         return ()
-    last = header.cells[-1]
-    if re.fullmatch(r'pt\d+_cam\d+_Y', last):
+    last_column = header.cells[-1]
+    if re.fullmatch(r'pt\d+_cam\d+_Y', last_column):
         return (f'{path}: of DLTdv8, add --one-based; of DLTdv5 to 7, --one-based --y-up',)
-    return (f'{path}: of Argus, add --y-up',) if re.search(r'_cam_\d+_y$', last) else ()
+    return (f'{path}: of Argus, add --y-up',) if re.search(r'_cam_\d+_y$', last_column) else ()
 
 
 def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:

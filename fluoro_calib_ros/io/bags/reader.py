@@ -76,7 +76,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     _check_definitions(source, fluoroscopes)
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(fluoroscopes.values())}
     notes: list[str] = []
-    first_message: dict[tuple[str, int, int], int] = {}  # in which a frame occurred
+    first_message: dict[tuple[str, int, int], int] = {}  # where a frame first occurred
     restarts = dict.fromkeys(frames, 0)
     segments: dict[str, list[int]] = {name: [] for name in frames}
     for message in iterate_messages(source, fluoroscopes):

@@ -115,24 +115,24 @@ class _Parser(argparse.ArgumentParser):
         rare = [
             a for group in self._action_groups if group.title in RARE for a in group._group_actions
         ]
-        shown = [action for action in self._actions if action not in rare]
+        visible_actions = [action for action in self._actions if action not in rare]
         exclusive = [
             group
             for group in self._mutually_exclusive_groups
             if not any(action in rare for action in group._group_actions)
         ]
-        formatter.add_usage(self.usage, shown, exclusive)
+        formatter.add_usage(self.usage, visible_actions, exclusive)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         try:
             super()._check_value(action, value)
         except argparse.ArgumentError as error:
             names = [str(choice) for choice in action.choices or ()]
-            close = difflib.get_close_matches(str(value), names, 1)
-            if not close:
+            matches = difflib.get_close_matches(str(value), names, 1)
+            if not matches:
                 raise
             raise argparse.ArgumentError(
-                action, f'{error.message}; did you mean {close[0]!r}?'
+                action, f'{error.message}; did you mean {matches[0]!r}?'
             ) from None
 
 
@@ -150,10 +150,10 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
         from ..report.html import versions
 
-        found = versions()
-        own = found.pop('fluoro_calib_ros')
-        others = ', '.join(f'{name} {version}' for name, version in found.items())
-        print(f'fluoro_calib_ros {own} ({others})')
+        package_versions = versions()
+        program_version = package_versions.pop('fluoro_calib_ros')
+        dependencies = ', '.join(f'{name} {version}' for name, version in package_versions.items())
+        print(f'fluoro_calib_ros {program_version} ({dependencies})')
         parser.exit()
 
 
@@ -262,8 +262,8 @@ def _run(words: list[str]) -> None:
             print_status(f'defaults of {options.rig_file.path}')
         passed = options.module.run(options)
     except (DataError, OSError) as error:
-        known = command if command in [module.NAME for module in COMMANDS] else ''
-        program = styled(f'fluoro-calib {known}'.rstrip() + ':', 'red', sys.stderr)
+        known_command = command if command in [module.NAME for module in COMMANDS] else ''
+        program = styled(f'fluoro-calib {known_command}'.rstrip() + ':', 'red', sys.stderr)
         print(f'{program} {printable(shortened(str(error)))}', file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:

@@ -69,13 +69,13 @@ def run(arguments: argparse.Namespace) -> bool:
     check_output_folder(arguments.out, RESULT_FOLDER, inputs)
     calibrations = read_calibrations(arguments.calibration)
     print_notes(disagreements(arguments.calibration, calibrations))
-    known = read_names(arguments.calibration)
-    survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
+    stored_names = read_names(arguments.calibration)
+    survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
     recording = read_source(
         arguments.source,
         image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
         fluoroscopes=arguments.fluoroscopes,
-        settings=file_settings(arguments, names=known.merged(survey.names)),
+        settings=file_settings(arguments, names=stored_names.merged(survey.names)),
         selection=bag_selection(arguments),
     )
     print_notes((*survey.notes, *recording.notes))
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> bool:
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)
     save_result(arguments.out, result, covariance=arguments.covariance)
     print_findings(result.findings, 'doubtful: ')
-    holds = not any(found.kind in CONTRADICTIONS for found in result.findings)
+    holds = not any(finding.kind in CONTRADICTIONS for finding in result.findings)
     text = HOLDS if holds else DOES_NOT_HOLD
     verdict = styled_verdict(text, 'pass' if holds else 'fail')
     document = {**written_document(result), 'holds': holds}

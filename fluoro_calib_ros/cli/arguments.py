@@ -228,8 +228,8 @@ def options_of(kind: type[T], arguments: argparse.Namespace, **values: Any) -> T
 
     An option without an argument keeps its default. Raises ValueError.
     """
-    given = {n: getattr(arguments, n) for n in declared(kind) if hasattr(arguments, n)}
-    return kind(**{**given, **values})
+    parsed = {n: getattr(arguments, n) for n in declared(kind) if hasattr(arguments, n)}
+    return kind(**{**parsed, **values})
 
 
 def add_read_limits(parser: argparse.ArgumentParser) -> None:
@@ -414,13 +414,13 @@ def add_scheduler(parser: argparse.ArgumentParser, task: str = 'extract the imag
         '(needs: pip install fluoro_calib_ros[cluster]); scheduler and workers can run any code '
         'here: tcp:// only on this machine, else with certificates',
     )
-    for name, what in (
+    for name, description in (
         ('ca', 'certificate of the authority of the cluster'),
         ('cert', 'certificate of this process'),
         ('key', 'its key'),
     ):
         group.add_argument(
-            f'--tls-{name}', default='', metavar='FILE', help=f'with tls://: {what} (PEM)'
+            f'--tls-{name}', default='', metavar='FILE', help=f'with tls://: {description} (PEM)'
         )
     group.add_argument(
         '--trusted-network',

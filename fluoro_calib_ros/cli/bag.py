@@ -111,7 +111,9 @@ def _info(arguments: argparse.Namespace) -> None:
     faults = report.faults
     document = {
         'files': report.files,
-        'topics': {topic: _topic_document(each) for topic, each in report.topics.items()},
+        'topics': {
+            topic: _topic_document(topic_report) for topic, topic_report in report.topics.items()
+        },
         'without_partner': report.without_partner,
         'lost': report.lost,
         'damages': [vars(damage) for damage in report.damages],
@@ -150,16 +152,16 @@ def become_node(node: str, parameters: Mapping[str, Any]) -> NoReturn:
 
 
 def _info_text(report: BagReport, faults: list[str]) -> str:
-    first = [min(topic.log_ns) for topic in report.topics.values()]
-    last = [max(topic.log_ns) for topic in report.topics.values()]
+    first_ns = [min(topic.log_ns) for topic in report.topics.values()]
+    last_ns = [max(topic.log_ns) for topic in report.topics.values()]
     total = sum(len(topic.log_ns) for topic in report.topics.values())
     lines = [f'{total} messages in {len(report.files)} files']
-    if first:
-        seconds = (max(last) - min(first)) * 1e-9
-        lines.append(f'from {_time(min(first))} to {_time(max(last))} ({seconds:.3f} s)')
-    for topic, each in report.topics.items():
-        rate = f', {1e9 / each.interval_ns:.1f} Hz' if each.interval_ns > 0 else ''
-        lines.append(f'  {topic} [{each.type}]: {len(each.log_ns)} messages{rate}')
+    if first_ns:
+        seconds = (max(last_ns) - min(first_ns)) * 1e-9
+        lines.append(f'from {_time(min(first_ns))} to {_time(max(last_ns))} ({seconds:.3f} s)')
+    for topic, topic_report in report.topics.items():
+        rate = f', {1e9 / topic_report.interval_ns:.1f} Hz' if topic_report.interval_ns > 0 else ''
+        lines.append(f'  {topic} [{topic_report.type}]: {len(topic_report.log_ns)} messages{rate}')
     lines += [f'fault: {fault}' for fault in faults] or ['no faults found']
     return '\n'.join(map(printable, lines))
 
@@ -183,22 +185,22 @@ def _topic_document(topic: TopicReport) -> dict[str, Any]:
 def _damage_text(damage: Damage) -> str:
     """Return the lost time range, and the topics if known, as text."""
     if damage.start_ns is None and damage.end_ns is None:
-        when = 'all of the file'
+        period = 'all of the file'
     elif damage.end_ns is None:
-        when = f'after {_time(damage.start_ns or 0)}'
+        period = f'after {_time(damage.start_ns or 0)}'
     elif damage.start_ns is None:
-        when = f'before {_time(damage.end_ns)}'
+        period = f'before {_time(damage.end_ns)}'
     else:
-        when = f'between {_time(damage.start_ns)} and {_time(damage.end_ns)}'
+        period = f'between {_time(damage.start_ns)} and {_time(damage.end_ns)}'
     counts = ', '.join(f'{topic} {count}' for topic, count in damage.lost.items())
-    return f'gone: {when} ({damage.path}: {damage.cause})' + (f': {counts}' if counts else '')
+    return f'gone: {period} ({damage.path}: {damage.cause})' + (f': {counts}' if counts else '')
 
 
 def _time(ns: int) -> str:
     """Return a time as UTC to the millisecond."""
-    seconds, rest = divmod(ns, 10**9)
+    seconds, remainder_ns = divmod(ns, 10**9)
     try:
         text = datetime.fromtimestamp(seconds, timezone.utc).strftime('%Y-%m-%dT%H:%M:%S')
     except (OverflowError, ValueError, OSError):
         return f'{ns} ns'
-    return f'{text}.{rest // 10**6:03d}Z'
+    return f'{text}.{remainder_ns // 10**6:03d}Z'

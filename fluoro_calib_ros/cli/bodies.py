@@ -105,8 +105,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.neutral is not None:
         if not joints:
             raise DataError('--neutral: there are no joints, give --joints')
-        given = argparse.Namespace(**{**vars(arguments), 'source': arguments.neutral})
-        neutral = read_oriented_source(given, path)[0].frames
+        neutral_arguments = argparse.Namespace(**{**vars(arguments), 'source': arguments.neutral})
+        neutral = read_oriented_source(neutral_arguments, path)[0].frames
     options = options_of(
         BodiesOptions,
         arguments,
@@ -157,19 +157,21 @@ def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:
     summary = outcome.summary()
     lines = [f'{len(outcome.exposures)} exposures, written to {arguments.out}']
     lines += [
-        f'{name}: {one["poses"]} poses, sd {one["sd_mm"]:.3f} mm and {one["sd_deg"]:.3f} degrees '
-        f'(medians); condition number {one["condition_per_m"]:.0f} per m, mean error of the '
-        f'rigid body {one["mean_error_mm"]:.3f} mm'
-        for name, one in summary['bodies'].items()
+        f'{name}: {figures["poses"]} poses, sd {figures["sd_mm"]:.3f} mm and '
+        f'{figures["sd_deg"]:.3f} degrees (medians); condition number '
+        f'{figures["condition_per_m"]:.0f} per m, mean error of the rigid body '
+        f'{figures["mean_error_mm"]:.3f} mm'
+        for name, figures in summary['bodies'].items()
     ]
     lines += [
-        f'{joint}: {name} over {one["range_deg"]:.1f} degrees, sd {one["sd_deg"]:.3f} (median)'
+        f'{joint}: {name} over {figures["range_deg"]:.1f} degrees, sd {figures["sd_deg"]:.3f} '
+        '(median)'
         for joint, angles in summary['joints'].items()
-        for name, one in angles.items()
+        for name, figures in angles.items()
     ]
     document = {
         'out': str(arguments.out),
         **summary,
-        'findings': [finding_document(found) for found in outcome.findings],
+        'findings': [finding_document(finding) for finding in outcome.findings],
     }
     print_result(arguments, document, '\n'.join(lines))

@@ -100,11 +100,11 @@ def _add_adjustment(parser: argparse.ArgumentParser) -> None:
         elif name not in INTERNAL:
             group = model if name in OF_MODEL else adjustment
             add_option(group, option, **_METAVARS.get(name, {}))
-    together = adjustment.add_mutually_exclusive_group()
-    together.add_argument(
+    exclusive = adjustment.add_mutually_exclusive_group()
+    exclusive.add_argument(
         '--joint', action='store_true', help='all fluoroscopes in one adjustment'
     )
-    together.add_argument(
+    exclusive.add_argument(
         '--separate', action='store_true', help='one fluoroscope after the other (the default)'
     )
     add_principal_distance(
@@ -220,8 +220,8 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
     from ..io.phantom import has_exposures, read_moving_points
     from ..jobs.sources import read_orientations, read_survey
 
-    known = read_orientations(arguments.known_orientation, file_settings(arguments))
-    moving = bool(known) and has_exposures(arguments.phantom)
+    known_orientations = read_orientations(arguments.known_orientation, file_settings(arguments))
+    moving = bool(known_orientations) and has_exposures(arguments.phantom)
     survey = None if moving else read_survey(arguments.phantom, file_settings(arguments))
     recording = _recording(arguments, survey)
     print_notes((*(() if survey is None else survey.notes), *recording.notes))
@@ -241,7 +241,7 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
         joint=arguments.joint,
         principal_distance=arguments.principal_distance,
         names=names,
-        known_orientations=known,
+        known_orientations=known_orientations,
         about={
             'observations': str(arguments.source),
             'phantom': str(arguments.phantom),

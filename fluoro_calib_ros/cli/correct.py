@@ -105,10 +105,10 @@ def run(arguments: argparse.Namespace) -> None:
     elif suffix_of(arguments.source) in POINTS_SUFFIXES or not arguments.source.exists():
         _correct_points(arguments, calibrations)  # reports a missing file, too
     else:
-        known = listed(('.csv', *READ_SUFFIXES))
+        suffixes = listed(('.csv', *READ_SUFFIXES))
         raise DataError(
             f'{arguments.source}: files with the ending {suffix_of(arguments.source)} cannot be '
-            f'read, only {known} and folders of images'
+            f'read, only {suffixes} and folders of images'
         )
 
 
@@ -169,15 +169,15 @@ def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -
         angles=angles,
     )
     with ProgressBar(source.name) as progress:
-        done = run_image_correction(request, progress)
+        corrected = run_image_correction(request, progress)
     if angles is not None:
-        unknown = sum(number not in angles for number in range(1, done.images + 1))
-        if unknown:
+        without_angle = sum(number not in angles for number in range(1, corrected.images + 1))
+        if without_angle:
             print_note(
-                f'{source}: {unknown} of {done.images} images have no angle in '
+                f'{source}: {without_angle} of {corrected.images} images have no angle in '
                 f'{arguments.angles}, they are corrected with the mean over the angles'
             )
-    _print_images(arguments, calibration, done)
+    _print_images(arguments, calibration, corrected)
 
 
 def _print_images(

@@ -166,8 +166,8 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 
 
 def _follows_markers(arguments: argparse.Namespace) -> bool:
-    given = (arguments.markers, arguments.cluster_shapes, arguments.bodies)
-    return any(path is not None for path in given)
+    paths = (arguments.markers, arguments.cluster_shapes, arguments.bodies)
+    return any(path is not None for path in paths)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -261,21 +261,21 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 
     for name in arguments.fluoroscope:
         check_safe_name(name, '--fluoroscope')
-    given = (
+    optional_inputs = (
         arguments.markers,
         arguments.calibration,
         arguments.cluster_shapes,
         arguments.bodies,
     )
-    inputs = [*arguments.sources, *(path for path in given if path is not None)]
-    decide = arguments.out.with_name(f'{arguments.out.stem}.{DOUBTFUL}')
+    inputs = [*arguments.sources, *(path for path in optional_inputs if path is not None)]
+    doubtful_path = arguments.out.with_name(f'{arguments.out.stem}.{DOUBTFUL}')
     check_output_file(arguments.out, inputs)
-    check_output_file(decide, inputs)
+    check_output_file(doubtful_path, inputs)
     request = _marker_request(arguments)
     with ProgressBar('extract') as bar:
         outcome = run_marker_extraction(request, bar)
-    found = [(frame, flags) for frame, *flags in outcome.frames()]
-    write_extracted(arguments.out, found, request.target_names)
+    observed = [(frame, flags) for frame, *flags in outcome.frames()]
+    write_extracted(arguments.out, observed, request.target_names)
     for name, results in outcome.results.items():
         for result in results:
             if result.markers.reason:
@@ -290,9 +290,11 @@ def _run_markers(arguments: argparse.Namespace) -> None:
         print_note(text)
     doubtful = doubtful_ids(outcome)
     if doubtful:
-        known = Names({name: number for number, name in request.target_names.items()})
-        doubtful_table(doubtful, known).write(decide)
-        print_note(f'{decide}: decide on the doubtful ids there, and give it with --decisions')
+        marker_names = Names({name: number for number, name in request.target_names.items()})
+        doubtful_table(doubtful, marker_names).write(doubtful_path)
+        print_note(
+            f'{doubtful_path}: decide on the doubtful ids there, and give it with --decisions'
+        )
     print_result(
         arguments, _marker_document(arguments.out, outcome), _marker_text(arguments.out, outcome)
     )
@@ -311,7 +313,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     angles = ImageAngles(angle_options(arguments), angle_of(arguments))
     angles.check(arguments.sources, arguments.fluoroscope)
     sources, image_size = sequences(arguments.sources, arguments.fluoroscope)
-    first: Mapping[str, list[Frame]] = {}
+    first_frames: Mapping[str, list[Frame]] = {}
     target_names: Mapping[int, str] = {}
     if arguments.markers is not None:
         recording = read_source(
@@ -321,7 +323,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
             settings=file_settings(arguments, image_size=image_size),
         )
         print_notes(recording.notes)
-        first = recording.frames
+        first_frames = recording.frames
         target_names = recording.names.target_names()
     bodies = arguments.rigid
     if arguments.bodies is not None:
@@ -341,7 +343,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
             check_orientation(orientation, calibrations)
     return MarkerRequest(
         sources,
-        first,
+        first_frames,
         options_of(MarkerOptions, arguments),
         calibrations,
         orientation,
@@ -354,16 +356,16 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
 
 def _doubt_texts(spans: list[DoubtfulSpan], request: MarkerRequest) -> list[str]:
     """Return a sentence for each id that may be wrong."""
-    out = []
+    texts = []
     for span in spans:
         name = request.target_names.get(span.target_id, str(span.target_id))
-        others = ' or '.join(request.target_names.get(i, str(i)) for i in span.others)
-        what = f'may be {others}' if others else 'may be something else'
-        out.append(
-            f'fluoroscope {span.fluoroscope}: marker {name} {what} in exposures {span.first} to '
+        candidates = ' or '.join(request.target_names.get(i, str(i)) for i in span.others)
+        doubt = f'may be {candidates}' if candidates else 'may be something else'
+        texts.append(
+            f'fluoroscope {span.fluoroscope}: marker {name} {doubt} in exposures {span.first} to '
             f'{span.last}: {span.reason}'
         )
-    return out
+    return texts
 
 
 def _marker_document(out: Path, outcome: MarkerOutcome) -> dict[str, Any]:
@@ -401,11 +403,11 @@ def _marker_text(out: Path, outcome: MarkerOutcome) -> str:
     """Return the summary as text."""
     lines = []
     for name, results in outcome.results.items():
-        found = sum(len(r.markers.target_id) for r in results)
-        all_of_them = found + sum(len(r.markers.missing) for r in results)
+        measured = sum(len(r.markers.target_id) for r in results)
+        total = measured + sum(len(r.markers.missing) for r in results)
         doubtful = sum(int(r.markers.doubtful.sum()) for r in results)
         lines.append(
-            f'fluoroscope {name}: {len(results)} images, {found} of {all_of_them} places of '
+            f'fluoroscope {name}: {len(results)} images, {measured} of {total} places of '
             f'markers measured, {doubtful} with a doubtful id'
         )
     exchanged = [d for d in outcome.decisions if d.kind == 'exchanged']

@@ -95,15 +95,15 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
 
     lines = []
     healed = outcome.healed
-    is_changed = any(one.cause in OF_RIG for one in outcome.diagnosis.changes)
+    is_changed = any(change.cause in OF_RIG for change in outcome.diagnosis.changes)
     if outcome.changed_meanwhile:
         lines.append(CHANGED_MEANWHILE)
     if healed is None or not is_changed:
         is_evident = is_changed or outcome.changed_meanwhile
-        evident = '' if is_evident else 'no change of the rig is evident: '
-        contain = 'its sd contain an unseen knock and an unseen drift of the distortion'
-        rest = 'nothing is written' if healed is None else contain
-        lines.append(f'{evident}it stays as it was calibrated, {rest}')
+        prefix = '' if is_evident else 'no change of the rig is evident: '
+        caveat = 'its sd contain an unseen knock and an unseen drift of the distortion'
+        conclusion = 'nothing is written' if healed is None else caveat
+        lines.append(f'{prefix}it stays as it was calibrated, {conclusion}')
     if healed is not None:
         for f, name in enumerate(outcome.orientation.fluoroscopes):
             if healed.changes[f].any():
@@ -129,10 +129,10 @@ def _change(value: NDArray[np.float64], sd: NDArray[np.float64]) -> str:
     parts = []
     if value[:6].any():
         shift = ', '.join(f'{v:.2f} (sd {s:.2f})' for v, s in zip(value[:3], sd[:3]))
-        turn = ', '.join(
+        rotation = ', '.join(
             f'{v:.3f} (sd {s:.3f})' for v, s in zip(np.degrees(value[3:6]), np.degrees(sd[3:6]))
         )
-        parts.append(f'source moved by {shift} mm, sensor turned by {turn} degrees')
+        parts.append(f'source moved by {shift} mm, sensor turned by {rotation} degrees')
     if value[6:8].any():
         shift = ', '.join(f'{v:.2f} (sd {s:.2f})' for v, s in zip(value[6:8], sd[6:8]))
         parts.append(f'principal point moved by {shift} px')

@@ -27,19 +27,19 @@ MAX_EXPOSURES = 10**6
 
 def exposure_numbers(text: str) -> set[int]:
     """Parse 1,4-6 as a set of exposure numbers."""
-    out: set[int] = set()
+    exposures: set[int] = set()
     try:
         for part in text.split(','):
             low, _, high = part.partition('-')
             numbers = range(int(low), int(high or low) + 1)
             if not numbers or numbers[0] < 0 or len(numbers) > MAX_EXPOSURES:
                 raise ValueError
-            out.update(numbers)
+            exposures.update(numbers)
     except ValueError:
         raise argparse.ArgumentTypeError(
             f'{text!r} is not a list of exposures, such as 1,4-6'
         ) from None
-    return out
+    return exposures
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,8 +72,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.sources import read_calibrated_source, read_survey
     from ..report.tables import orientation_text
 
-    known = read_names(arguments.calibration)
-    survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
+    stored_names = read_names(arguments.calibration)
+    survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
     recording, calibrations = read_calibrated_source(
         arguments.source,
         arguments.calibration,
@@ -87,14 +87,14 @@ def run(arguments: argparse.Namespace) -> None:
     frames = recording.frames
     if arguments.exposures is not None:
         frames = {
-            name: [frame for frame in of_fluoroscope if frame.number in arguments.exposures]
-            for name, of_fluoroscope in frames.items()
+            name: [frame for frame in view_frames if frame.number in arguments.exposures]
+            for name, view_frames in frames.items()
         }
-    present = saved_orientation(arguments.calibration)
-    if present is not None and not belongs_to(present, calibrations):
-        present = None
+    saved = saved_orientation(arguments.calibration)
+    if saved is not None and not belongs_to(saved, calibrations):
+        saved = None
     with ErrorsAt(arguments.source):
-        outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id, present=present)
+        outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id, present=saved)
     path = save_orientation(arguments.calibration, outcome.orientation)
     print_notes(outcome.findings)
     document = {

@@ -33,8 +33,8 @@ def styled(text: str, style: str, stream: TextIO) -> str:
 
     https://no-color.org: NO_COLOR applies if it is not empty.
     """
-    plain = os.environ.get('NO_COLOR') or os.environ.get('TERM') == 'dumb'
-    if not style or plain or not stream.isatty():
+    no_color = os.environ.get('NO_COLOR') or os.environ.get('TERM') == 'dumb'
+    if not style or no_color or not stream.isatty():
         return text
     return f'\033[{STYLES[style]}m{text}\033[0m'
 
@@ -80,9 +80,9 @@ def print_notes(notes: Iterable[object]) -> None:
 
 def print_findings(findings: Iterable[Finding], error: str) -> None:
     """Print the findings on a calibration on standard error; error: prefix of errors."""
-    begin = {Severity.NOTE: 'not used: ', Severity.WARNING: '', Severity.ERROR: error}
-    for found in sorted(findings, key=lambda one: (1, 0, 2)[one.severity]):
-        print_note(f'{begin[found.severity]}{found}')
+    prefixes = {Severity.NOTE: 'not used: ', Severity.WARNING: '', Severity.ERROR: error}
+    for finding in sorted(findings, key=lambda f: (1, 0, 2)[f.severity]):
+        print_note(f'{prefixes[finding.severity]}{finding}')
 
 
 def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:

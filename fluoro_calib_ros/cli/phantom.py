@@ -144,9 +144,9 @@ def run(arguments: argparse.Namespace) -> None:
     )
     phantom = drawing.phantom()
     require_size(phantom)
-    drawn = picture_bytes(phantom_figure(drawing), picture.suffix.lower())
+    picture_content = picture_bytes(phantom_figure(drawing), picture.suffix.lower())
     write_phantom(arguments.out, phantom)
-    write_bytes(picture, drawn)
+    write_bytes(picture, picture_content)
     count = len(phantom.target_id)
     document = {
         'out': str(arguments.out),

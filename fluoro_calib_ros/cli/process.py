@@ -133,12 +133,12 @@ def run(arguments: argparse.Namespace) -> bool:
 @contextmanager
 def working_directory(folder: Path) -> Iterator[None]:
     """Change the working directory until the block ends."""
-    before = Path.cwd()
+    previous_folder = Path.cwd()
     os.chdir(folder)
     try:
         yield
     finally:
-        os.chdir(before)
+        os.chdir(previous_folder)
 
 
 def _process(
@@ -195,11 +195,15 @@ def study_steps(study: StudyFile, parse: Parse) -> tuple[list[Step], dict[str, l
     The working directory must be the folder of the study. Raises DataError for an invalid option.
     """
     make = _StepMaker(study, parse)
-    first = []
+    calibration_steps = []
     if study.calibrate is not None:
         source = str(study.calibrate[SOURCE])
-        first.append(make('', 'calibrate', study.calibrate, (source,), study.calibration))
-    return first, {trial.name: list(_trial_steps(study, trial, make)) for trial in study.trials}
+        calibration_steps.append(
+            make('', 'calibrate', study.calibrate, (source,), study.calibration)
+        )
+    return calibration_steps, {
+        trial.name: list(_trial_steps(study, trial, make)) for trial in study.trials
+    }
 
 
 def _trial_steps(study: StudyFile, trial: Trial, make: _StepMaker) -> Iterator[Step]:
@@ -263,7 +267,7 @@ def _option_words(key: str, value: Any, error: Callable[[str], NoReturn]) -> lis
     if isinstance(value, bool):
         return [word] if value else []
     if isinstance(value, list):
-        return [part for one in value for part in _option_words(key, one, error)]
+        return [part for item in value for part in _option_words(key, item, error)]
     if not isinstance(value, str | int | float):
         error(f'the key {key} is neither a text nor a number, true, false or a list')
     return [f'{word}={value}']
@@ -294,20 +298,20 @@ class _Work:
 
     def run(self, chains: Iterable[Sequence[Step]], workers: int) -> None:
         """Run chains of steps, at most `workers` at a time; a chain stops at a failed step."""
-        waiting = deque((place, deque(chain)) for place, chain in enumerate(chains, 1))
+        waiting = deque((number, deque(chain)) for number, chain in enumerate(chains, 1))
         total = len(waiting)
         running: list[tuple[tuple[int, deque[Step]], _Started]] = []
         while waiting or running:
             while waiting and len(running) < workers:
-                place, steps = chain = waiting.popleft()
-                started = self._next(steps, f'{place} of {total}')
+                number, steps = chain = waiting.popleft()
+                started = self._next(steps, f'{number} of {total}')
                 if started is not None:
                     running.append((chain, started))
-            for one in list(running):
-                chain, started = one
+            for entry in list(running):
+                chain, started = entry
                 if started.process.poll() is None:
                     continue
-                running.remove(one)
+                running.remove(entry)
                 if self._ended(started).ok:
                     waiting.appendleft(chain)
             time.sleep(POLL_S if running else 0)
@@ -319,9 +323,9 @@ class _Work:
         while chain:
             step = chain.popleft()
             digest = digest_of(step)
-            kept = self._kept(step, digest)
-            if kept is not None:
-                self.done[step.key] = kept
+            earlier = self._kept(step, digest)
+            if earlier is not None:
+                self.done[step.key] = earlier
                 continue
             folder = step.out.parent
             make_folder(folder)
@@ -440,7 +444,7 @@ def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[s
     for joint, angles in document['joints'].items():
         for name, angle in angles.items():
             cells |= {f'{joint}_{name}_{key}': angle[key] for key in ('range_deg', 'sd_deg')}
-    doubtful = [found['sentence'] for found in document['findings']]
+    doubtful = [finding['sentence'] for finding in document['findings']]
     if doubtful and row['verdict'] == 'pass':
         cells |= {'verdict': 'cannot tell', 'cause': '; '.join(doubtful)}
     return cells

@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> None:
     if outcome.noise is not None:
         print_note(f'{arguments.source}: {outcome.noise.sentence}')
     if outcome.widening > 1:
-        check = (
+        advice = (
             'check the sigma of the image points, whether they are corrected already or count '
             'from 1, and whether a fluoroscope has moved since its calibration'
         )
@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace) -> None:
             f'{arguments.source}: the rays miss each other by more than their standard deviations '
             f'allow; the limit of false matches was widened {outcome.widening:.1f} times, to '
             f'{arguments.reject * outcome.widening:.1f} standard deviations; '
-            f'{outcome.cause or check}'
+            f'{outcome.cause or advice}'
         )
     _print(arguments, outcome)
 

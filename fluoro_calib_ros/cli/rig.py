@@ -44,12 +44,12 @@ def find_rig(words: Sequence[str], command: str) -> RigFile | None:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument('--rig', type=Path)
     try:
-        given = parser.parse_known_args(list(words))[0].rig
+        path = parser.parse_known_args(list(words))[0].rig
     except argparse.ArgumentError:  # the parser of the command reports the error
         return None
-    if given is None and Path(NAME).is_file():
-        given = Path(NAME)
-    return None if given is None else read_rig_file(given)
+    if path is None and Path(NAME).is_file():
+        path = Path(NAME)
+    return None if path is None else read_rig_file(path)
 
 
 def add_rig(parser: argparse.ArgumentParser, command: str, rig: RigFile | None) -> None:

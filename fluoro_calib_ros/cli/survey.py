@@ -92,21 +92,21 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.sources import read_source, read_survey
     from ..jobs.survey import SurveyRequest, survey
 
-    given = read_survey(arguments.phantom, file_settings(arguments))
+    initial = read_survey(arguments.phantom, file_settings(arguments))
     recording = read_source(
         arguments.source,
         image_size=arguments.image_size,
         fluoroscopes=arguments.fluoroscopes,
         collect=arguments.collect,
-        settings=file_settings(arguments, names=given.names),
+        settings=file_settings(arguments, names=initial.names),
         selection=bag_selection(arguments),
     )
-    print_notes((*given.notes, *recording.notes))
+    print_notes((*initial.notes, *recording.notes))
     print_unpaired(arguments.source, recording.unpaired)
     request = SurveyRequest(
         recording.frames,
-        given.phantom,
-        _distances(arguments, given.names),
+        initial.phantom,
+        _distances(arguments, initial.names),
         options_of(CalibrationOptions, arguments),
         arguments.principal_distance,
         keep_given=arguments.keep_given,
@@ -115,16 +115,16 @@ def run(arguments: argparse.Namespace) -> None:
         outcome = survey(request, print_round)
     print_findings(outcome.findings, 'this cannot be right: ')
     failed = [check for check in outcome.validation.checks if check.passed is False]
-    written = not failed or arguments.force
-    if written:
-        write_phantom(arguments.out, outcome.phantom, given.names)
-    path = str(arguments.out) if written else None
+    is_written = not failed or arguments.force
+    if is_written:
+        write_phantom(arguments.out, outcome.phantom, initial.names)
+    path = str(arguments.out) if is_written else None
     calibrate = ('calibrate', 'OTHER_EXPOSURES', '--phantom', arguments.out, '--out', 'result')
     print_result(
-        arguments, _document(outcome, path), _text(outcome, path), calibrate if written else ()
+        arguments, _document(outcome, path), _text(outcome, path), calibrate if is_written else ()
     )
     if failed:
-        hint = '' if written else ', nothing is written (--force writes it)'
+        hint = '' if is_written else ', nothing is written (--force writes it)'
         raise DataError(
             f'the verdict is fail{hint}: {failed[0]}', at=arguments.source, kind=failed[0].kind
         )
@@ -168,6 +168,6 @@ def _text(outcome: SurveyOutcome, path: str | None) -> str:
     from ..report.tables import verdict_text
 
     sd = outcome.beads.sd_mm
-    counted = f'{len(sd)} beads surveyed, sd of a coordinate {min(sd):.3f} to {max(sd):.3f} mm'
+    summary = f'{len(sd)} beads surveyed, sd of a coordinate {min(sd):.3f} to {max(sd):.3f} mm'
     written = '' if path is None else f'written to {path}'
-    return '\n'.join([counted, verdict_text(outcome.validation), written])
+    return '\n'.join([summary, verdict_text(outcome.validation), written])

@@ -78,9 +78,9 @@ def run(arguments: argparse.Namespace) -> bool:
 
     calibrations = read_calibrations(arguments.directory, arguments.fluoroscopes)
     document = read_result(arguments.directory)
-    mixed = exchanged(arguments.directory, document, calibrations)
-    if mixed is not None:
-        raise DataError(mixed)
+    finding = exchanged(arguments.directory, document, calibrations)
+    if finding is not None:
+        raise DataError(finding)
     request = _request(arguments, calibrations)
     request = request.with_exposures(used_exposures(document, request.frames))
     orientation = saved_orientation(arguments.directory)
@@ -91,16 +91,16 @@ def run(arguments: argparse.Namespace) -> bool:
     note = edited(arguments.directory, document)
     if note is not None:
         validation = replace(validation, notes=(note, *validation.notes))
-    written = write_validation(arguments.directory, validation)
+    verdict_document = write_validation(arguments.directory, validation)
     passed = validation.verdict == 'pass'
-    following = ('reconstruct', 'MEASURED', '--calibration', arguments.directory)
+    next_step = ('reconstruct', 'MEASURED', '--calibration', arguments.directory)
     if orientation is None:
-        following = ('correct', 'POINTS', '--calibration', arguments.directory)
+        next_step = ('correct', 'POINTS', '--calibration', arguments.directory)
     print_result(
         arguments,
-        written,
+        verdict_document,
         verdict_text(validation),
-        (*following, '--out', 'points.csv') if passed else (),
+        (*next_step, '--out', 'points.csv') if passed else (),
     )
     return passed
 
@@ -117,25 +117,25 @@ def _request(arguments: argparse.Namespace, calibrations: Calibrations) -> Calib
 
     frames: Frames | None = None
     phantom = None
-    known = read_names(arguments.directory)
+    stored_names = read_names(arguments.directory)
     if arguments.source is not None:
         recording = read_source(
             arguments.source,
             image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
             fluoroscopes=arguments.fluoroscopes,
             collect=arguments.collect,
-            settings=file_settings(arguments, names=known),
+            settings=file_settings(arguments, names=stored_names),
             selection=BagSelection(angles=angle_options(arguments)),
         )
         print_notes(recording.notes)
         print_unpaired(arguments.source, recording.unpaired)
         frames = recording.frames
     if arguments.phantom is not None:
-        survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
+        survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
         print_notes(survey.notes)
         phantom = survey.phantom
-    saved = arguments.directory / PHANTOM
-    if frames is not None and (phantom is not None or saved.exists()):
-        given = CalibrationRequest(frames, phantom or read_phantom(saved))
-        frames = without_unusable(given)[0].frames  # excluded as in `calibrate`
+    saved_phantom = arguments.directory / PHANTOM
+    if frames is not None and (phantom is not None or saved_phantom.exists()):
+        source_request = CalibrationRequest(frames, phantom or read_phantom(saved_phantom))
+        frames = without_unusable(source_request)[0].frames  # excluded as in `calibrate`
     return read_request(arguments.directory, calibrations, frames, phantom)

@@ -66,8 +66,8 @@ def isolate_ros_graph() -> None:
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     if 'ROS_DOMAIN_ID' not in os.environ:
         domains = [1 + (os.getpid() + i) % 100 for i in range(100)]
-        free = next((domain for domain in domains if _is_free(domain)), domains[0])
-        os.environ['ROS_DOMAIN_ID'] = str(free)
+        free_domain = next((domain for domain in domains if _is_free(domain)), domains[0])
+        os.environ['ROS_DOMAIN_ID'] = str(free_domain)
 
 
 def _is_free(domain: int) -> bool:
@@ -146,13 +146,13 @@ def calibration_errors(bags: Path, calibrations: Calibrations) -> dict[str, floa
     errors = {}
     for name, calibration in calibrations.items():
         ideal = _ideal_projection(rig[name], points)
-        parts = rig[name]['distortion']
+        distortion = rig[name]['distortion']
         field = DistortionField(
-            np.array(parts['centre']),
-            parts['pincushion'],
-            np.array(parts['s_shape']),
-            parts['spiral'],
-            np.array(parts['ripples']),
+            np.array(distortion['centre']),
+            distortion['pincushion'],
+            np.array(distortion['s_shape']),
+            distortion['spiral'],
+            np.array(distortion['ripples']),
         )
         observed = field.distort(ideal)
         u, v, *_ = calibration.correct_arrays(observed[:, 0], observed[:, 1])
@@ -177,10 +177,10 @@ def space_figures(
         First fluoroscope, whose frame numbers the points have.
     """
     truth = _true_markers(bags)
-    true = [truth[p.frame_number, i] for p, _ in points for i in p.target_id]
+    true_mm = [truth[p.frame_number, i] for p, _ in points for i in p.target_id]
     measured = np.concatenate([p.xyz_mm for p, _ in points])
     covariance = np.concatenate([p.covariance for p, _ in points])
-    error = _error_after_rigid_fit(measured, np.array(true))
+    error = _error_after_rigid_fit(measured, np.array(true_mm))
     weighted = np.einsum('ni,nij,nj->n', error, np.linalg.inv(covariance), error)
     latency = [
         (stamp - sent[first, p.frame_number][1]) * 1e-6
@@ -200,17 +200,17 @@ def projective_lack_of_fit(uv: NDArray[np.float64], ideal: NDArray[np.float64]) 
     """Return the RMSE of a coordinate after the best projective map of uv (n, 2) to ideal [px]."""
     x, y = (uv - IMAGE_CENTRE).T / IMAGE_SCALE
     u, v = (ideal - IMAGE_CENTRE).T / IMAGE_SCALE
-    one = np.ones_like(x)
-    zero = np.zeros_like(x)
+    ones = np.ones_like(x)
+    zeros = np.zeros_like(x)
     rows = np.concatenate(
         [
-            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1),
-            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1),
+            np.stack([x, y, ones, zeros, zeros, zeros, -u * x, -u * y], axis=1),
+            np.stack([zeros, zeros, zeros, x, y, ones, -v * x, -v * y], axis=1),
         ]
     )
     h, *_ = np.linalg.lstsq(rows, np.concatenate([u, v]), rcond=None)
     h = np.append(h, 1.0).reshape(3, 3)
-    mapped = np.stack([x, y, one], axis=1) @ h.T
+    mapped = np.stack([x, y, ones], axis=1) @ h.T
     residual = IMAGE_SCALE * (mapped[:, :2] / mapped[:, 2:] - np.stack([u, v], axis=1))
     return float(np.sqrt(np.mean(residual**2)))
 

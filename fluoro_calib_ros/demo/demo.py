@@ -100,14 +100,14 @@ def wait_for_stream(
 
     tracked: number of frames by fluoroscope. Raises DemoError.
     """
-    seen = 0
+    received_count = 0
     quiet_since = time.monotonic()
 
     def is_over() -> bool:
-        nonlocal seen, quiet_since
+        nonlocal received_count, quiet_since
         count = len(client.sent) + len(client.corrected) + len(client.points)
-        if count != seen or player.poll() is None:
-            seen = count
+        if count != received_count or player.poll() is None:
+            received_count = count
             quiet_since = time.monotonic()
         complete = (
             len(client.corrected) >= sum(tracked.values())
@@ -144,16 +144,16 @@ def report(
     frames, _ = collect_recorded(read_frames(bags / 'calibration').frames)
     job = calibrate(frames, read_phantom(bags / 'phantom.csv'))
     figures = write_figures(job, out / 'figures')
-    same = {
+    is_equal = {
         name: job.calibrations[name].calibration_id == calibration.calibration_id
         for name, calibration in client.calibrations.items()
     }
-    of_knee, comparison = texts
-    lines = [*_image_lines(bags, client, job), '', _space_line(bags, client), of_knee, '']
+    knee_text, comparison = texts
+    lines = [*_image_lines(bags, client, job), '', _space_line(bags, client), knee_text, '']
     lines += ['Calibrated from coordinates and from radiographs:', comparison, '']
     lines.append(
         'Calibration through the nodes and without ROS the same to the last bit: '
-        + ', '.join(f'{name} {"yes" if ok else "NO"}' for name, ok in same.items())
+        + ', '.join(f'{name} {"yes" if ok else "NO"}' for name, ok in is_equal.items())
     )
     lines.append(
         f'Figures: {out / "figures"} ({len(figures)} pictures), calibration: {out / "calibration"}'
@@ -164,7 +164,7 @@ def report(
     text = '\n'.join(lines)
     write_text(out / 'table.txt', text + '\n')
     print('\n' + text)
-    return all(same.values())
+    return all(is_equal.values())
 
 
 def _image_lines(bags: Path, client: DemoClient, job: CalibrationResult) -> list[str]:
@@ -212,8 +212,8 @@ def _space_line(bags: Path, client: DemoClient) -> str:
 def _clear(out: Path) -> None:
     """Create the folder of the results; delete logs and calibrations of an earlier run."""
     out.mkdir(parents=True, exist_ok=True)
-    for old in (*out.glob('*.log'), *(out / 'calibration').glob('*.calibration.npz')):
-        old.unlink()
+    for leftover in (*out.glob('*.log'), *(out / 'calibration').glob('*.calibration.npz')):
+        leftover.unlink()
 
 
 def _frame_counts(bag: Path) -> dict[str, int]:
@@ -243,10 +243,10 @@ def _raise_if_failed(nodes: NodeProcesses, out: Path) -> None:
 
 def default_bags() -> Path:
     """Return the folder bags in the working directory, or the one installed in a workspace."""
-    here = Path('bags')
+    local_folder = Path('bags')
     prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
     installed = [Path(prefix) / 'share' / 'fluoro_calib_ros' / 'bags' for prefix in prefixes]
-    return next((folder for folder in (here, *installed) if folder.is_dir()), here)
+    return next((folder for folder in (local_folder, *installed) if folder.is_dir()), local_folder)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -272,32 +272,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.out.mkdir(parents=True, exist_ok=True)
         recorded = RecordedRig.of(options.bags, names)
         twin = ImageTwin(recorded, options.out / 'calibration_images')
-        with demo_clients(names, '', NAMESPACE) as (client, of_images), twin:
+        with demo_clients(names, '', NAMESPACE) as (client, image_client), twin:
             knee = LiveKnee(recorded, options.out / 'knee')
             lost = run_graph(options.bags, options.out, client, knee)
             print('5  the same from radiographs: player -> extraction node -> calibration node')
-            from_images = calibrate_from_images(twin, options.bags, options.out, of_images)
+            image_calibrations = calibrate_from_images(
+                twin, options.bags, options.out, image_client
+            )
             comparison = comparison_table(
                 options.bags,
                 names,
-                {'coordinates': client.calibrations, 'images': from_images},
+                {'coordinates': client.calibrations, 'images': image_calibrations},
             )
             make_folder(options.out / 'figures')
-            of_knee = knee.assess(client.joint_angles, options.out / 'figures' / 'knee_live.png')
-            good = report(
+            knee_text = knee.assess(client.joint_angles, options.out / 'figures' / 'knee_live.png')
+            passed = report(
                 options.bags,
                 options.out,
                 client=client,
                 lost=lost,
                 start=start,
-                texts=(of_knee, comparison),
+                texts=(knee_text, comparison),
             )
     except (DemoError, DataError, OSError) as error:
         print(f'fluoro_calib_demo: {error}', file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)
-    sys.exit(0 if good else 1)
+    sys.exit(0 if passed else 1)
 
 
 if __name__ == '__main__':

@@ -57,12 +57,12 @@ class RecordedRig:
     @classmethod
     def of(cls, bags: Path, names: Sequence[str]) -> RecordedRig:
         """Return the rig of fluoroscopes described by the truth in a folder of bags."""
-        made_with = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
+        settings = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
         return cls(
-            virtual_rig(made_with['seed'], made_with['strength'], names),
-            seed=made_with['seed'],
-            noise_px=made_with['noise'],
-            exposures=made_with['exposures'],
+            virtual_rig(settings['seed'], settings['strength'], names),
+            seed=settings['seed'],
+            noise_px=settings['noise'],
+            exposures=settings['exposures'],
         )
 
 
@@ -217,7 +217,7 @@ class LiveKnee:
         frames = simulate_knee(recorded.rig, self._knee, self._truth, recorded.noise_px).frames
         self.bag = out / 'landing'
         self.parameters = {'bodies': out / BODIES, 'joints': out / JOINTS}
-        self.frames = {name: len(of_view) for name, of_view in frames.items()}
+        self.frames = {name: len(view_frames) for name, view_frames in frames.items()}
         make_folder(out / TRUTH)
         write_knee(out, self._knee)
         write_bag(self.bag, frames)
@@ -241,12 +241,12 @@ class LiveKnee:
         error = motion.angles[known] - self._truth.angles[number[known] - 1]
         normalised = np.mean((error / motion.sd[known, :3]) ** 2)
         rmse = np.degrees(np.sqrt(np.mean(error**2, axis=0)))
-        named = ', '.join(
+        rmse_text = ', '.join(
             f'{name.replace("_", " ")} {value:.2f}'
             for name, value in zip(motion.angle_names, rmse)
         )
         return (
             f'Knee that lands, live: {np.count_nonzero(known)} of {len(self._truth.angles)} '
-            f'exposures; RMSE against the truth [degrees]: {named}; squared error over its '
+            f'exposures; RMSE against the truth [degrees]: {rmse_text}; squared error over its '
             f'variance {normalised:.2f}; picture {picture}'
         )

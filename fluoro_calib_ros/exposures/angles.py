@@ -60,17 +60,17 @@ class AngleOptions:
         set.
         """
         names = tuple(fluoroscopes)
-        given = joints_by_fluoroscope(self.angle_joint)
-        if isinstance(given, str):
-            return dict.fromkeys(names, given) if given else {}
+        joints = joints_by_fluoroscope(self.angle_joint)
+        if isinstance(joints, str):
+            return dict.fromkeys(names, joints) if joints else {}
         if self.of_rig or others:
-            return {name: joint for name, joint in given.items() if name in names}
-        for name in given:
+            return {name: joint for name, joint in joints.items() if name in names}
+        for name in joints:
             if name not in names:
                 raise ValueError(
                     f'angle_joint: there is no fluoroscope {name!r}, only {", ".join(names)}'
                 )
-        return given
+        return joints
 
     def tracks(self, fluoroscopes: Iterable[str], capacity: int | None = CAPACITY) -> JointAngles:
         """Return the joint angles of fluoroscopes, without states yet. Raises ValueError."""
@@ -124,15 +124,15 @@ class AngleTrack:
             angle = math.nan
         if self._is_cut and stamp_ns < self._stamps[0]:
             self._clear()
-        place = len(self._stamps)
-        if place and stamp_ns <= self._stamps[-1]:
-            place = bisect_left(self._stamps, stamp_ns)
-            if self._stamps[place] == stamp_ns:
-                self._angles[place] = angle
+        index = len(self._stamps)
+        if index and stamp_ns <= self._stamps[-1]:
+            index = bisect_left(self._stamps, stamp_ns)
+            if self._stamps[index] == stamp_ns:
+                self._angles[index] = angle
                 return
         self.late += self._asked is not None and stamp_ns <= self._asked
-        self._stamps.insert(place, stamp_ns)
-        self._angles.insert(place, angle)
+        self._stamps.insert(index, stamp_ns)
+        self._angles.insert(index, angle)
         if self._capacity is not None and len(self._stamps) > self._capacity:
             half = len(self._stamps) // 2
             del self._stamps[:half]
@@ -142,26 +142,26 @@ class AngleTrack:
     def at(self, stamp_ns: int) -> float | None:
         """Return the angle at a time [rad], None if unknown."""
         self._asked = stamp_ns
-        place = bisect_right(self._stamps, stamp_ns) - 1
-        if place < 0 or stamp_ns - self._stamps[place] > self._max_age_ns:
+        index = bisect_right(self._stamps, stamp_ns) - 1
+        if index < 0 or stamp_ns - self._stamps[index] > self._max_age_ns:
             return None
-        angle = self._angles[place]
+        angle = self._angles[index]
         return None if math.isnan(angle) else angle
 
     def doubt(self, stamp_ns: int) -> str:
         """Return why the angle at a time is unknown, '' if it is known."""
         if not self._stamps:
             return 'it has no state yet'
-        place = bisect_right(self._stamps, stamp_ns) - 1
-        if place < 0:
+        index = bisect_right(self._stamps, stamp_ns) - 1
+        if index < 0:
             return 'it has no state at or before the stamp of the exposure'
-        age_ns = stamp_ns - self._stamps[place]
+        age_ns = stamp_ns - self._stamps[index]
         if age_ns > self._max_age_ns:
             return (
                 f'its last state is {age_ns * 1e-9:.3f} s older than the exposure, more than '
                 f'angle_max_age, {self._max_age_ns * 1e-9:g} s'
             )
-        if math.isnan(self._angles[place]):
+        if math.isnan(self._angles[index]):
             return f'its position is no angle between -{MAX_ANGLE:.2f} and {MAX_ANGLE:.2f} rad'
         return ''
 

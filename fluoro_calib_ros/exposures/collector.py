@@ -101,21 +101,21 @@ class ExposureCollector:
         Returns '' if the pair was collected, otherwise the reason. The first frame of a stream is
         collected like a single shot, and discarded if the next ones show that the phantom moves.
         """
-        first = self.fluoroscopes[0]
-        now = pair[first].stamp_ns
+        first_name = self.fluoroscopes[0]
+        stamp_ns = pair[first_name].stamp_ns
         still_ns = self.still.still_time_s * 1e9
         self._confirm_single(pair, still_ns)
-        window = [p for p in self._recent if 0 <= now - p[first].stamp_ns <= still_ns]
-        moved = max((self._displacement(pair, p) for p in window), default=0.0)
-        span = max((now - p[first].stamp_ns for p in window), default=0)
-        self._update_streaming(now, bool(window), still_ns)
+        window = [p for p in self._recent if 0 <= stamp_ns - p[first_name].stamp_ns <= still_ns]
+        max_displacement = max((self._displacement(pair, p) for p in window), default=0.0)
+        span = max((stamp_ns - p[first_name].stamp_ns for p in window), default=0)
+        self._update_streaming(stamp_ns, bool(window), still_ns)
         self._recent.append(pair)
-        if moved > self.still.still_px:
+        if max_displacement > self.still.still_px:
             return 'the phantom moves'
         if self._streaming and span < still_ns / 2:
             return 'too few frames to tell whether the phantom stands still'
-        for known in self.exposures:
-            if self._displacement(pair, known) < self.still.new_px:
+        for exposure in self.exposures:
+            if self._displacement(pair, exposure) < self.still.new_px:
                 return 'this pose of the phantom is already collected'
         refusal = self.add(pair)
         self._single = pair if not refusal and not window else None
@@ -123,22 +123,22 @@ class ExposureCollector:
 
     def _confirm_single(self, pair: Pair, still_ns: float) -> None:
         """Discard the single shot if the next frames show that the phantom moved."""
-        single = self._single
-        if single is None:
+        single_shot = self._single
+        if single_shot is None:
             return
-        first = self.fluoroscopes[0]
-        if not 0 <= pair[first].stamp_ns - single[first].stamp_ns <= still_ns:
+        first_name = self.fluoroscopes[0]
+        if not 0 <= pair[first_name].stamp_ns - single_shot[first_name].stamp_ns <= still_ns:
             self._single = None
-        elif self._displacement(pair, single) > self.still.still_px:
+        elif self._displacement(pair, single_shot) > self.still.still_px:
             self._single = None
-            self._discard(single)
+            self._discard(single_shot)
 
     def _discard(self, pair: Pair) -> None:
         """Remove an exposure."""
-        self.exposures = [known for known in self.exposures if known is not pair]
+        self.exposures = [exposure for exposure in self.exposures if exposure is not pair]
         self.coverage = {}
-        for known in self.exposures:
-            self._cover(known)
+        for exposure in self.exposures:
+            self._cover(exposure)
 
     def _displacement(self, one: Pair, other: Pair) -> float:
         """Return the largest displacement [px] of all fluoroscopes between two pairs."""
@@ -150,10 +150,10 @@ class ExposureCollector:
         A stream begins with the first frame that follows another one in time, and ends with a long
         gap.
         """
-        before = self._recent[-1][self.fluoroscopes[0]].stamp_ns if self._recent else None
+        previous_ns = self._recent[-1][self.fluoroscopes[0]].stamp_ns if self._recent else None
         if follows:
             self._streaming = True
-        elif before is None or not 0 <= now - before <= MAX_GAP * still_ns:
+        elif previous_ns is None or not 0 <= now - previous_ns <= MAX_GAP * still_ns:
             self._streaming = False
 
     def add(self, pair: Pair) -> str:
@@ -162,8 +162,8 @@ class ExposureCollector:
         Returns '' if the pair was collected, otherwise the reason.
         """
         numbers = {pair[name].number for name in self.fluoroscopes}
-        for known in self.exposures:
-            if any(known[name].number == pair[name].number for name in self.fluoroscopes):
+        for exposure in self.exposures:
+            if any(exposure[name].number == pair[name].number for name in self.fluoroscopes):
                 return f'frame {min(numbers)} is collected already'
         self.exposures.append(pair)
         self._cover(pair)
@@ -226,19 +226,19 @@ class RadiographCollector:
         """Keep the radiographs of the frames of all collected exposures when they arrive."""
         pairs = tuple(exposures)
         for name, recent in self._recent.items():
-            kept = self._wanted[name]
+            previous = self._wanted[name]
             stamps = [pair[name].stamp_ns for pair in pairs]
-            self._wanted[name] = {t: kept.get(t) or recent.pop(t, b'') for t in stamps}
+            self._wanted[name] = {t: previous.get(t) or recent.pop(t, b'') for t in stamps}
 
     def of(self, frames: Frames) -> dict[str, dict[int, bytes]]:
         """Return the available radiographs of frames, by fluoroscope and exposure."""
         return {
             name: {
                 frame.number: jpeg
-                for frame in own
+                for frame in view_frames
                 if (jpeg := self._wanted[name].get(frame.stamp_ns))
             }
-            for name, own in frames.items()
+            for name, view_frames in frames.items()
         }
 
 
@@ -268,13 +268,13 @@ def collect_recorded(
     unpaired : dict of str to int
         Number of frames without a partner, by fluoroscope.
     """
-    still = StillOptions()
+    still_options = StillOptions()
     pairer = CompletePairer(frames, RecordedPairing(pair_by, tolerance_s).unlimited())
-    collector = ExposureCollector(frames, still)
+    collector = ExposureCollector(frames, still_options)
     if mode == 'auto':
-        mode = 'still' if any(_is_stream(f, still) for f in frames.values()) else 'all'
+        mode = 'still' if any(_is_stream(f, still_options) for f in frames.values()) else 'all'
     collect = collector.offer if mode == 'still' else collector.add
-    recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+    recorded = [frame for view_frames in frames.values() for frame in view_frames]
     for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
         for pair in pairer.add(frame):
             collect(pair)
@@ -317,12 +317,12 @@ def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
     if exposures >= RECOMMENDED_EXPOSURES and covered:
         corners = '; if the field of view is not round, show beads in the corners, too'
         return Readiness(True, f'ready to calibrate{corners if coverage.is_round else ""}')
-    further = RECOMMENDED_EXPOSURES - exposures
-    count = f'{further} more, ' if further > 0 else ''
+    remaining = RECOMMENDED_EXPOSURES - exposures
+    count = f'{remaining} more, ' if remaining > 0 else ''
     if not areas:
         return Readiness(False, f'{count}with the phantom turned and tilted')
-    where = ' and '.join(AREAS[area] for area in areas)
-    return Readiness(False, f'{count}with beads {where} of the image', areas)
+    areas_text = ' and '.join(AREAS[area] for area in areas)
+    return Readiness(False, f'{count}with beads {areas_text} of the image', areas)
 
 
 # Coverage of the image by the collected image points.
@@ -379,9 +379,9 @@ class Coverage:
 
         This is assumed if most of the inscribed ellipse is covered, and no point lies outside.
         """
-        inside = _ellipse()
-        within = float(np.mean(self.covered[inside]))
-        return within >= ROUND_FROM and not self._occupied[~inside].any()
+        in_ellipse = _ellipse()
+        fraction = float(np.mean(self.covered[in_ellipse]))
+        return fraction >= ROUND_FROM and not self._occupied[~in_ellipse].any()
 
     @property
     def fraction_of_field(self) -> float:
@@ -428,24 +428,24 @@ def without_repeats(
     for which a repeated pose is not a repeated exposure.
     """
     images = {
-        name: {frame.number: frame for frame in of_one}
-        for name, of_one in frames.items()
+        name: {frame.number: frame for frame in view_frames}
+        for name, view_frames in frames.items()
         if name not in known
     }
     groups = _groups(images)
-    repeated = {later for group in groups for later in group[1:]}
-    out = {}
+    repeated = {number for group in groups for number in group[1:]}
+    unrepeated = {}
     findings = []
-    for name, of_one in frames.items():
+    for name, view_frames in frames.items():
         if name not in images:
-            out[name] = list(of_one)
+            unrepeated[name] = list(view_frames)
             continue
-        joined = []
+        joined_frames = []
         for group in groups:
-            own = [images[name][number] for number in group if number in images[name]]
-            if own:
-                joined.append(_joined(own, group[0]))
-        out[name] = joined
+            group_frames = [images[name][number] for number in group if number in images[name]]
+            if group_frames:
+                joined_frames.append(_joined(group_frames, group[0]))
+        unrepeated[name] = joined_frames
         numbers = tuple(sorted(int(number) for number in images[name] if number in repeated))
         if numbers:
             findings.append(
@@ -458,25 +458,25 @@ def without_repeats(
                     numbers={'exposures': len(numbers)},
                 )
             )
-    return out, findings
+    return unrepeated, findings
 
 
 def _groups(images: Mapping[str, Mapping[int, Frame]]) -> list[list[int]]:
     """Return the numbers of the exposures of each pose, in order."""
-    numbers = sorted({number for of_one in images.values() for number in of_one})
-    tables = [_Table(list(of_one.values())) for of_one in images.values() if of_one]
+    numbers = sorted({number for view_frames in images.values() for number in view_frames})
+    tables = [_Table(list(view_frames.values())) for view_frames in images.values() if view_frames]
     groups: list[list[int]] = []
     for number in numbers:
-        first = np.array([group[0] for group in groups], dtype=np.int64)
-        same = np.zeros(len(first), dtype=bool)
-        other = np.zeros(len(first), dtype=bool)
+        first_numbers = np.array([group[0] for group in groups], dtype=np.int64)
+        any_same = np.zeros(len(first_numbers), dtype=bool)
+        any_other = np.zeros(len(first_numbers), dtype=bool)
         for table in tables:
-            is_same, is_other = table.compare(number, first)
-            same |= is_same
-            other |= is_other
-        there = np.flatnonzero(same & ~other)
-        if len(there):
-            groups[there[0]].append(number)
+            is_same, is_other = table.compare(number, first_numbers)
+            any_same |= is_same
+            any_other |= is_other
+        matches = np.flatnonzero(any_same & ~any_other)
+        if len(matches):
+            groups[matches[0]].append(number)
         else:
             groups.append([number])
     return groups
@@ -490,46 +490,46 @@ class _Table:
         self._row = {frame.number: row for row, frame in enumerate(frames)}
         self._uv = np.full((len(frames), len(ids), 2), np.nan)
         self._angle = np.array([np.nan if f.angle is None else f.angle for f in frames])
-        for own, frame in zip(self._uv, frames):
-            own[np.searchsorted(ids, frame.target_id)] = frame.uv
+        for frame_uv, frame in zip(self._uv, frames):
+            frame_uv[np.searchsorted(ids, frame.target_id)] = frame.uv
 
     def compare(
         self, number: int, others: NDArray[np.int64]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return whether exposures (k,) have the pose of `number`, and whether another one."""
-        same = np.zeros(len(others), dtype=bool)
-        has = np.array([other in self._row for other in others.tolist()], dtype=bool)
-        if number not in self._row or not has.any():
-            return same, same.copy()
+        is_same = np.zeros(len(others), dtype=bool)
+        is_present = np.array([other in self._row for other in others.tolist()], dtype=bool)
+        if number not in self._row or not is_present.any():
+            return is_same, is_same.copy()
         row = self._row[number]
-        rows = np.array([self._row[other] for other in others[has].tolist()])
+        rows = np.array([self._row[other] for other in others[is_present].tolist()])
         distance = np.linalg.norm(self._uv[rows] - self._uv[row], axis=2)
         common = np.isfinite(distance)
-        seen = np.isfinite(self._uv[..., 0]).sum(axis=1)
-        enough = SHARE * np.minimum(seen[rows], seen[row])
-        comparable = common.sum(axis=1) >= np.maximum(MIN_COMMON_TARGETS, enough)
-        still = np.zeros(len(rows), dtype=bool)
-        for place in np.flatnonzero(comparable):
-            still[place] = np.median(distance[place][common[place]]) <= STILL_PX
-        turned = np.abs(self._angle[rows] - self._angle[row]) > SAME_ANGLE_RAD
-        same[has] = still & ~turned
-        return same, has & ~same
+        seen_count = np.isfinite(self._uv[..., 0]).sum(axis=1)
+        min_common = SHARE * np.minimum(seen_count[rows], seen_count[row])
+        comparable = common.sum(axis=1) >= np.maximum(MIN_COMMON_TARGETS, min_common)
+        is_still = np.zeros(len(rows), dtype=bool)
+        for index in np.flatnonzero(comparable):
+            is_still[index] = np.median(distance[index][common[index]]) <= STILL_PX
+        is_rotated = np.abs(self._angle[rows] - self._angle[row]) > SAME_ANGLE_RAD
+        is_same[is_present] = is_still & ~is_rotated
+        return is_same, is_present & ~is_same
 
 
 def _joined(frames: Sequence[Frame], number: int) -> Frame:
     """Return a frame with the median image points of frames, which is the mean for two."""
-    first = frames[0]
+    first_frame = frames[0]
     if len(frames) == 1:
-        return first if first.number == number else replace(first, number=number)
+        return first_frame if first_frame.number == number else replace(first_frame, number=number)
     ids = np.unique(np.concatenate([frame.target_id for frame in frames]))
     values = np.full((len(frames), len(ids), 3), np.nan)
-    for own, frame in zip(values, frames):
-        at = np.searchsorted(ids, frame.target_id)
-        own[at, :2] = frame.uv
+    for frame_values, frame in zip(values, frames):
+        columns = np.searchsorted(ids, frame.target_id)
+        frame_values[columns, :2] = frame.uv
         if frame.sigma is not None:
-            own[at, 2] = frame.sigma
+            frame_values[columns, 2] = frame.sigma
     sigma = None
     if all(frame.sigma is not None for frame in frames):
         sigma = np.nanmedian(values[..., 2], axis=0)
     uv = np.nanmedian(values[..., :2], axis=0)
-    return replace(first, number=number, target_id=ids, uv=uv, sigma=sigma)
+    return replace(first_frame, number=number, target_id=ids, uv=uv, sigma=sigma)

@@ -53,24 +53,26 @@ def decided(
     points are excluded. Raises DataError that names the row, for a decision on something that does
     not exist, and for one that gives an id twice in an exposure.
     """
-    out: dict[str, list[Frame]] = {}
+    result_frames: dict[str, list[Frame]] = {}
     counts = np.zeros(3, dtype=int)
-    met: set[int] = set()
-    for name, of_one in frames.items():
-        out[name] = []
-        own = [(k, d) for k, d in enumerate(decisions) if d.fluoroscope == name]
-        for frame in of_one:
-            here = [(k, d) for k, d in own if d.first <= frame.number <= d.last]
-            found = [(k, d) for k, d in here if _rows(frame, d).any()]
-            met.update(k for k, _ in found)
-            left, points, renamed = _decided(frame, [d for _, d in found])
-            counts += (left is None, points, renamed)
-            out[name] += [] if left is None else [left]
+    applied: set[int] = set()
+    for name, view_frames in frames.items():
+        result_frames[name] = []
+        view_decisions = [(k, d) for k, d in enumerate(decisions) if d.fluoroscope == name]
+        for frame in view_frames:
+            frame_decisions = [
+                (k, d) for k, d in view_decisions if d.first <= frame.number <= d.last
+            ]
+            matching = [(k, d) for k, d in frame_decisions if _rows(frame, d).any()]
+            applied.update(k for k, _ in matching)
+            remaining_frame, points, renamed = _decided(frame, [d for _, d in matching])
+            counts += (remaining_frame is None, points, renamed)
+            result_frames[name] += [] if remaining_frame is None else [remaining_frame]
     for k, decision in enumerate(decisions):
-        if k not in met:
+        if k not in applied:
             raise DataError(f'{decision.where}: {_missing(frames, decision)}')
     exposures, points, renamed = counts.tolist()
-    return out, (exposures, points, renamed)
+    return result_frames, (exposures, points, renamed)
 
 
 def _decided(frame: Frame, decisions: Sequence[PointDecision]) -> tuple[Frame | None, int, int]:
@@ -89,11 +91,11 @@ def _decided(frame: Frame, decisions: Sequence[PointDecision]) -> tuple[Frame | 
         return None, 0, 0
     pair = first_repeated(ids[keep])
     if pair is not None:
-        again = int(ids[keep][pair[0]])
-        cause = next((d for d in decisions if d.new_id == again), decisions[0])
+        repeated_id = int(ids[keep][pair[0]])
+        cause = next((d for d in decisions if d.new_id == repeated_id), decisions[0])
         raise DataError(
-            f'{cause.where}: exposure {frame.number} then has target {again} twice; decide on '
-            'the other image point, too'
+            f'{cause.where}: exposure {frame.number} then has target {repeated_id} twice; decide '
+            'on the other image point, too'
         )
     sigma = None if frame.sigma is None else frame.sigma[keep]
     changed = replace(frame, target_id=ids[keep], uv=frame.uv[keep], sigma=sigma)
@@ -114,7 +116,7 @@ def _missing(frames: Frames, decision: PointDecision) -> str:
     if name not in frames:
         return f'there is no fluoroscope {name!r}, only {", ".join(frames)}'
     span = range(decision.first, decision.last + 1)
-    where = f'{span[0]} to {span[-1]}' if len(span) > 1 else f'{span[0]}'
+    range_text = f'{span[0]} to {span[-1]}' if len(span) > 1 else f'{span[0]}'
     if not any(frame.number in span for frame in frames[name]):
-        return f'fluoroscope {name} has no exposure {where}'
-    return f'exposure {where} of fluoroscope {name} has no target {decision.target_id}'
+        return f'fluoroscope {name} has no exposure {range_text}'
+    return f'exposure {range_text} of fluoroscope {name} has no target {decision.target_id}'

@@ -107,10 +107,10 @@ def frames_of_targets(frames: Frames, target_id: NDArray[np.int64]) -> dict[str,
     return {
         name: [
             frame.rows(seen)
-            for frame in of_one
+            for frame in view_frames
             if (seen := np.isin(frame.target_id, target_id)).any()
         ]
-        for name, of_one in frames.items()
+        for name, view_frames in frames.items()
     }
 
 
@@ -266,8 +266,8 @@ def cells_of(uv: ArrayLike, image_size: ArrayLike, count: int) -> NDArray[np.int
 
     Points off the image belong to the nearest cell.
     """
-    place = (np.asarray(uv, dtype=float) + 0.5) / np.asarray(image_size) * count
-    return np.clip(np.floor(place), 0, count - 1).astype(np.int64)
+    cell = (np.asarray(uv, dtype=float) + 0.5) / np.asarray(image_size) * count
+    return np.clip(np.floor(cell), 0, count - 1).astype(np.int64)
 
 
 # Targets whose coordinates are known in every exposure, such as motion capture markers.
@@ -321,10 +321,10 @@ class MovingPoints:
         coordinates that do not make a valid phantom.
         """
         phantom = Phantom(self.ids(self.exposure, self.target_id), self.xyz_mm, self.sd_mm)
-        out: dict[str, list[Frame]] = {}
-        for name, exposures in frames.items():
-            out[name] = []
-            for frame in exposures:
+        renumbered: dict[str, list[Frame]] = {}
+        for name, view_frames in frames.items():
+            renumbered[name] = []
+            for frame in view_frames:
                 ids = self.ids(frame.number, frame.target_id)
                 known = (phantom.index(ids) >= 0) & (np.asarray(frame.target_id) < self.base)
                 if not known.all():
@@ -332,8 +332,8 @@ class MovingPoints:
                         f'fluoroscope {name}, exposure {frame.number}: the coordinates of target '
                         f'{np.asarray(frame.target_id)[~known][0]} are not given'
                     )
-                out[name].append(replace(frame, target_id=ids))
-        return out, phantom
+                renumbered[name].append(replace(frame, target_id=ids))
+        return renumbered, phantom
 
 
 MIN_TOGETHER = 4  # minimum number of targets at the same image point to be fill values
@@ -357,13 +357,13 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
     if uv.shape != (len(ids), 2) or (frame.sigma is not None and len(frame.sigma) != len(ids)):
         return frame, None
     finite = np.isfinite(uv).all(axis=1)
-    together = finite & _together(uv)
-    off = finite & ~together & ~points_on_image(uv, frame.image_size)
-    unknown = np.zeros(len(ids), dtype=bool) if phantom is None else phantom.index(ids) < 0
-    single = (off | unknown) & ~together
-    if not few(int(single.sum()), int(np.sum(~together))):
-        single = np.zeros(len(ids), dtype=bool)
-    stray = single | together
+    coincident = finite & _together(uv)
+    off_image = finite & ~coincident & ~points_on_image(uv, frame.image_size)
+    off_phantom = np.zeros(len(ids), dtype=bool) if phantom is None else phantom.index(ids) < 0
+    single_stray = (off_image | off_phantom) & ~coincident
+    if not few(int(single_stray.sum()), int(np.sum(~coincident))):
+        single_stray = np.zeros(len(ids), dtype=bool)
+    stray = single_stray | coincident
     if not stray.any() or stray.all():
         return frame, None
     kept = ~stray
@@ -374,16 +374,16 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
         sigma=None if frame.sigma is None else np.asarray(frame.sigma)[kept],
     )
     causes = [
-        f'target {first_few(ids[chosen])} {cause}'
-        for chosen, cause in (
-            (off & single, 'off the image'),
-            (unknown & single & ~off, 'not on the phantom'),
+        f'target {first_few(ids[mask])} {cause}'
+        for mask, cause in (
+            (off_image & single_stray, 'off the image'),
+            (off_phantom & single_stray & ~off_image, 'not on the phantom'),
             (
-                together,
+                coincident,
                 'at the image point of others, a fill value for targets that are not seen',
             ),
         )
-        if chosen.any()
+        if mask.any()
     ]
     count = int(stray.sum())
     return cleaned, Finding(
@@ -392,9 +392,9 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
         replace(frame.place, target_id=tuple(ids[stray].tolist())),
         severity=Severity.NOTE,
         numbers={
-            'off_image': int(np.sum(off & single)),
-            'not_on_phantom': int(np.sum(unknown & single & ~off)),
-            'fill_values': int(together.sum()),
+            'off_image': int(np.sum(off_image & single_stray)),
+            'not_on_phantom': int(np.sum(off_phantom & single_stray & ~off_image)),
+            'fill_values': int(coincident.sum()),
         },
     )
 
@@ -404,20 +404,20 @@ def frames_without_strays(
 ) -> tuple[dict[str, list[Frame]], list[Finding]]:
     """Exclude a few stray points of the frames; return the frames by fluoroscope and findings."""
     findings = []
-    out: dict[str, list[Frame]] = {}
-    for name, exposures in frames.items():
-        cleaned = [without_strays(frame, phantom) for frame in exposures]
-        out[name] = [frame for frame, _ in cleaned]
-        findings += [found for _, found in cleaned if found is not None]
-    return out, findings
+    clean_frames: dict[str, list[Frame]] = {}
+    for name, view_frames in frames.items():
+        cleaned = [without_strays(frame, phantom) for frame in view_frames]
+        clean_frames[name] = [frame for frame, _ in cleaned]
+        findings += [finding for _, finding in cleaned if finding is not None]
+    return clean_frames, findings
 
 
 def _together(uv: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return (n,) which image points (n, 2) coincide with enough others to be fill values."""
     if len(uv) < MIN_TOGETHER:
         return np.zeros(len(uv), dtype=bool)
-    _, place, count = np.unique(uv, axis=0, return_inverse=True, return_counts=True)
-    return count[place.reshape(-1)] >= max(MIN_TOGETHER, MIN_SHARE_TOGETHER * len(uv))
+    _, inverse, count = np.unique(uv, axis=0, return_inverse=True, return_counts=True)
+    return count[inverse.reshape(-1)] >= max(MIN_TOGETHER, MIN_SHARE_TOGETHER * len(uv))
 
 
 Frames = Mapping[str, Sequence[Frame]]  # by fluoroscope

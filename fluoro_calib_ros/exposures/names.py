@@ -75,43 +75,43 @@ def number_names(names: Iterable[str], known: Mapping[str, int] | None = None) -
     Otherwise they are counted in their order, from the first free number.
     """
     known = known or {}
-    new = [name for name in dict.fromkeys(names) if name not in known]
-    taken = set(known.values())
-    ids = _common_numbers(new)
-    if ids is None or taken & set(ids):
-        first = max(taken, default=0) + 1
-        ids = list(range(first, first + len(new)))
-    return {**known, **dict(zip(new, ids))}
+    new_names = [name for name in dict.fromkeys(names) if name not in known]
+    used_numbers = set(known.values())
+    ids = _common_numbers(new_names)
+    if ids is None or used_numbers & set(ids):
+        first_number = max(used_numbers, default=0) + 1
+        ids = list(range(first_number, first_number + len(new_names)))
+    return {**known, **dict(zip(new_names, ids))}
 
 
 def _common_numbers(names: Sequence[str]) -> list[int] | None:
     """Return the numbers in names that differ in nothing else, None for other names."""
-    parts = [_NUMBERED.fullmatch(name) for name in names]
-    found = [part for part in parts if part is not None]
-    if len(found) < len(names):
+    matches = [_NUMBERED.fullmatch(name) for name in names]
+    numbered = [match for match in matches if match is not None]
+    if len(numbered) < len(names):
         return None
-    around = {(part['before'], part['after']) for part in found}
-    numbers = [int(part['number']) for part in found]
-    if len(around) > 1 or len(set(numbers)) < len(numbers) or max(numbers, default=0) > MAX_ID:
+    affixes = {(match['before'], match['after']) for match in numbered}
+    numbers = [int(match['number']) for match in numbered]
+    if len(affixes) > 1 or len(set(numbers)) < len(numbers) or max(numbers, default=0) > MAX_ID:
         return None
     return numbers
 
 
 def safe_names(names: Iterable[str], known: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return a unique id of letters, digits, _ and - for every name of a fluoroscope."""
-    out = dict(known or {})
+    identities = dict(known or {})
     for name in dict.fromkeys(names):
-        if name in out:
+        if name in identities:
             continue
         stem = _UNSAFE.sub('_', name.strip())[: _MAX_NAME - 4] or 'fluoroscope'
-        taken = set(out.values())
+        used = set(identities.values())
         identity = stem
         number = 2
-        while identity in taken:
+        while identity in used:
             identity = f'{stem}_{number}'
             number += 1
-        out[name] = identity
-    return out
+        identities[name] = identity
+    return identities
 
 
 def without_trivial(ids: Mapping[str, int]) -> dict[str, int]:

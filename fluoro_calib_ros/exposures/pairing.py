@@ -141,7 +141,7 @@ def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> 
         return ''
     pairer = CompletePairer(frames, RecordedPairing().unlimited())
     pairer.stamps = StampAgreement(pairer.fluoroscopes, recent=None)
-    recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+    recorded = [frame for view_frames in frames.values() for frame in view_frames]
     for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
         pairer.add(frame)
     return pairer.stamps.disagreement()
@@ -358,8 +358,8 @@ class PartialPairer(_Counts):
                 return ready
             end = min(heads.values()) + self._tolerance
             names = [name for name, key in heads.items() if key <= end]
-            missing = len(queues) - len(heads) - len(self.silent)
-            if missing > 0 and not self._gives_up(heads, names):
+            missing_count = len(queues) - len(heads) - len(self.silent)
+            if missing_count > 0 and not self._gives_up(heads, names):
                 return ready
             ready += self._pop_exposure(names, end)
 
@@ -398,8 +398,8 @@ class PartialPairer(_Counts):
         """Stop waiting and start anew; return the exposures that were waiting."""
         ready: list[Exposure] = []
         while any(self._queues.values()):
-            first = min(queue[0][0] for queue in self._queues.values() if queue)
-            end = first + self._tolerance
+            first_key = min(queue[0][0] for queue in self._queues.values() if queue)
+            end = first_key + self._tolerance
             names = [name for name, queue in self._queues.items() if queue and queue[0][0] <= end]
             ready += self._pop_exposure(names, end)
         self._start()

@@ -113,14 +113,14 @@ def require_size(phantom: Phantom) -> None:
     low, high = EXTENT_MM
     if extent == 0 or low <= extent <= high:
         return
-    likely = [unit for unit, mm in UNITS_MM.items() if low <= extent * mm <= high]
-    if not likely:
-        why = 'this is no phantom'
+    units = [unit for unit, mm in UNITS_MM.items() if low <= extent * mm <= high]
+    if not units:
+        cause = 'this is no phantom'
     else:
-        why = f'the coordinates are in {likely[0]}, not in mm, or in another unit'
+        cause = f'the coordinates are in {units[0]}, not in mm, or in another unit'
     raise DataError(
         f'the phantom would be {extent:.3g} mm large, between {low:g} and {high:g} mm are '
-        f'possible: {why}',
+        f'possible: {cause}',
         kind=Kind.WRONG_UNIT,
         numbers={'extent_mm': extent},
     )
@@ -171,7 +171,7 @@ class Drawing:
     @property
     def blocked_id(self) -> NDArray[np.int64]:
         """Ids (b,) of the blocked places. Raises DataError for one outside the drawing."""
-        out = []
+        ids = []
         for place in self.blocked:
             row, column, layer = (*place, 1)[:3] if len(place) in (2, 3) else (0, 0, 0)
             if not (
@@ -181,8 +181,8 @@ class Drawing:
                     f'the blocked place {",".join(map(str, place))} is not on the drawing of '
                     f'{self.rows} rows, {self.columns} columns and {self.layers} layers'
                 )
-            out.append(((layer - 1) * self.rows + row - 1) * self.columns + column)
-        return np.unique(np.array(out, dtype=np.int64))
+            ids.append(((layer - 1) * self.rows + row - 1) * self.columns + column)
+        return np.unique(np.array(ids, dtype=np.int64))
 
     @property
     def places_mm(self) -> NDArray[np.float64]:

@@ -66,9 +66,9 @@ class StampAgreement:
         """
         first, *others = self._fluoroscopes
         for other in others:
-            found = self._compare(first, other)
-            if found:
-                return found
+            sentence = self._compare(first, other)
+            if sentence:
+                return sentence
         return ''
 
     def _compare(self, one: str, other: str) -> str:
@@ -81,8 +81,8 @@ class StampAgreement:
             return ''
         number, first, second = np.array(rows, dtype=np.int64).T
         interval = _frame_interval(number, first)
-        apart = (second - first).astype(float)
-        typical = float(np.median(np.abs(apart)))
+        offset = (second - first).astype(float)
+        typical = float(np.median(np.abs(offset)))
         if not interval or typical <= MAX_PART * interval:
             return ''
         count = typical / interval
@@ -128,10 +128,10 @@ class ExposureNumbers:
             return self._without_stamp[fluoroscope]
         nearest: tuple[int, int, set[str]] | None = None
         for exposure in self._recent:
-            apart = abs(exposure[0] - stamp_ns)
-            if apart > self._tolerance or fluoroscope in exposure[2]:
+            offset = abs(exposure[0] - stamp_ns)
+            if offset > self._tolerance or fluoroscope in exposure[2]:
                 continue
-            if nearest is None or apart <= abs(nearest[0] - stamp_ns):
+            if nearest is None or offset <= abs(nearest[0] - stamp_ns):
                 nearest = exposure  # the newest of equally near ones, for repeated recordings
         if nearest is None:
             self._last += 1

@@ -130,8 +130,8 @@ def encoding_of(content: bytes) -> str:
 
 def kind_not_read(content: bytes) -> str:
     """Return the kind of a file that is not read, with advice to the user; otherwise ''."""
-    begin = content.lstrip()
-    return next((kind for start, kind in _NOT_READ if begin.startswith(start)), '')
+    stripped = content.lstrip()
+    return next((kind for start, kind in _NOT_READ if stripped.startswith(start)), '')
 
 
 def check_rows(text: str, most: int, where: object) -> None:
@@ -180,12 +180,12 @@ def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
     target = os.path.realpath(path)  # write through a symbolic link, do not replace it
     folder, name = os.path.split(target)
     if os.path.lexists(target) and not os.path.isfile(target):
-        what = 'a directory' if os.path.isdir(target) else 'a device or pipe'
-        raise DataError(f'{path}: cannot be written (this is {what}, not a file)')
+        kind = 'a directory' if os.path.isdir(target) else 'a device or pipe'
+        raise DataError(f'{path}: cannot be written (this is {kind}, not a file)')
     temporary = os.path.join(folder, f'.{name[:100]}.{secrets.token_hex(8)}.tmp')
-    text: dict[str, Any] = {} if 'b' in mode else {'encoding': 'utf-8', 'newline': ''}
+    text_options: dict[str, Any] = {} if 'b' in mode else {'encoding': 'utf-8', 'newline': ''}
     try:
-        with open(temporary, mode.replace('w', 'x'), **text) as file:
+        with open(temporary, mode.replace('w', 'x'), **text_options) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())

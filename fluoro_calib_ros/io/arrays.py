@@ -128,11 +128,11 @@ def _read_members(
 ) -> dict[str, np.ndarray]:
     """Return the arrays of an archive, after checking its version."""
     members = archive.namelist()
-    total = sum(info.file_size for info in archive.infolist())
+    size = sum(info.file_size for info in archive.infolist())
     limits = read_limits()
-    if total > limits.max_file_bytes:
+    if size > limits.max_file_bytes:
         raise DataError(
-            f'{path}: its arrays take {total / 1e6:.0f} MB, more than {limits.max_file_mb} MB are '
+            f'{path}: its arrays take {size / 1e6:.0f} MB, more than {limits.max_file_mb} MB are '
             'not read'
         )
     version = _read_version(path, archive, layout)
@@ -161,9 +161,10 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
         )
     if not 1 <= version <= layout.version:
         last = layout.version
-        known = 'version 1' if last == 1 else f'versions 1 to {last}'
+        known_versions = 'version 1' if last == 1 else f'versions 1 to {last}'
         raise DataError(
-            f'{path}: the file has layout version {int(version)}, this program knows {known}'
+            f'{path}: the file has layout version {int(version)}, this program knows '
+            f'{known_versions}'
         )
     return int(version)
 

@@ -65,7 +65,7 @@ def read_bodies(path: PathLike) -> tuple[Body, ...]:
     """Read bodies from a CSV file, in file order. Raises DataError that names the row."""
     rows: dict[str, list[tuple[int, list[float]]]] = {}
     first_rows: dict[int, tuple[int, str]] = {}
-    most = read_limits().max_targets
+    max_markers = read_limits().max_targets
     for block in read_blocks(path, BODY_COLUMNS):
         unknown = [name for name in block.header if name not in BODY_COLUMNS]
         if unknown:
@@ -82,12 +82,12 @@ def read_bodies(path: PathLike) -> tuple[Body, ...]:
                 _fail_repeated(block, index, name, *first_rows[marker])
             first_rows[marker] = int(block.lines[index]), name
             rows.setdefault(name, []).append((marker, values))
-        if len(first_rows) > most:
-            raise DataError(f'{path}: bodies of more than {most} markers are not read')
+        if len(first_rows) > max_markers:
+            raise DataError(f'{path}: bodies of more than {max_markers} markers are not read')
     bodies = []
-    for name, of_body in rows.items():
-        values = np.array([numbers for _, numbers in of_body])
-        target_id = np.array([marker for marker, _ in of_body])
+    for name, body_rows in rows.items():
+        values = np.array([numbers for _, numbers in body_rows])
+        target_id = np.array([marker for marker, _ in body_rows])
         bodies.append(Body(name, target_id, values[:, :3], values[:, 3]))
     check_bodies(bodies)
     return tuple(bodies)
@@ -174,14 +174,14 @@ def read_joints(path: PathLike, bodies: Iterable[Body | str]) -> tuple[JointEntr
     Raises DataError that names file and joint.
     """
     document = read_toml(path)
-    found = document.pop('joint', None)
+    tables = document.pop('joint', None)
     for key in document:
         raise DataError(f'{path}, key {key}: unknown, there are tables [[joint]]')
-    if not isinstance(found, list) or not found:
+    if not isinstance(tables, list) or not tables:
         raise DataError(f'{path}: the file has no table [[joint]]')
-    if len(found) > MAX_JOINTS:
-        raise DataError(f'{path}: {len(found)} joints, more than {MAX_JOINTS} are not read')
-    entries = tuple(_entry(path, n, table) for n, table in enumerate(found, 1))
+    if len(tables) > MAX_JOINTS:
+        raise DataError(f'{path}: {len(tables)} joints, more than {MAX_JOINTS} are not read')
+    entries = tuple(_entry(path, n, table) for n, table in enumerate(tables, 1))
     with ErrorsAt(path):
         names = [body if isinstance(body, str) else body.name for body in bodies]
         check_joints([entry.joint for entry in entries], names)
@@ -205,10 +205,10 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
             raise DataError(f'{where}, key {key}: a text is expected')
         texts[key] = value
     try:
-        of = convention(texts['convention'])
-        of.check_side(texts['side'])
+        joint_convention = convention(texts['convention'])
+        joint_convention.check_side(texts['side'])
         frames = {
-            end: _frame(of, end, table.get(f'{end}_frame'), texts['side'])
+            end: _frame(joint_convention, end, table.get(f'{end}_frame'), texts['side'])
             for end in ('proximal', 'distal')
         }
         joint = Joint(
@@ -228,8 +228,8 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
 def _neutral(where: str, value: Any) -> tuple[int, int] | None:
     if value is None:
         return None
-    whole = isinstance(value, list) and all(type(v) is int for v in value)
-    if not whole or len(value) != 2 or not 0 <= value[0] <= value[1]:
+    are_integers = isinstance(value, list) and all(type(v) is int for v in value)
+    if not are_integers or len(value) != 2 or not 0 <= value[0] <= value[1]:
         raise DataError(f'{where}, key neutral: first and last exposure, such as [1, 100]')
     return value[0], value[1]
 
@@ -244,9 +244,9 @@ def _frame(of: Convention, end: str, table: Any, side: str) -> AnatomicalFrame:
         for key in table:
             if key not in FRAME_KEYS:
                 raise DataError(f'the key {key} is unknown, there are {", ".join(FRAME_KEYS)}')
-        given = [key for key in FRAME_KEYS[:4] if key in table]
-        if len(given) != 1:
-            raise DataError(f'one of {", ".join(FRAME_KEYS[:4])} is needed, not {len(given)}')
+        given_keys = [key for key in FRAME_KEYS[:4] if key in table]
+        if len(given_keys) != 1:
+            raise DataError(f'one of {", ".join(FRAME_KEYS[:4])} is needed, not {len(given_keys)}')
         return _frame_of(of, end, table, side)
     except DataError as error:
         raise DataError(f'{end}_frame: {error}') from None
@@ -289,7 +289,7 @@ def _array(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]
             return type(part) in (int, float)
         if not isinstance(part, list) or len(part) != size[0]:
             return False
-        return all(is_array(one, size[1:]) for one in part)
+        return all(is_array(item, size[1:]) for item in part)
 
     if not is_array(value, shape):
         raise DataError(f'{name} does not have {" x ".join(map(str, shape))} numbers')
@@ -351,7 +351,7 @@ MOTION_COLUMNS = ('body', 'exposure', 'time_s', *_VALUES, *(f'sd_{name}' for nam
 
 def pose_table(poses: Sequence[BodyPoses], start_ns: int) -> Table:
     """Return poses.csv, times relative to start_ns."""
-    return Table(COLUMNS, (row for one in poses for row in _rows(one, start_ns)))
+    return Table(COLUMNS, (row for body_poses in poses for row in _rows(body_poses, start_ns)))
 
 
 def _rows(one: BodyPoses, start_ns: int) -> Iterator[list[object]]:
@@ -370,7 +370,9 @@ def motion_table(
 ) -> Table:
     """Return motion.csv: velocities and accelerations with their standard deviations."""
     rows = (
-        _motion(body, row, one, start_ns) for row, body in enumerate(bodies) for one in exposures
+        _motion(body, row, exposure, start_ns)
+        for row, body in enumerate(bodies)
+        for exposure in exposures
     )
     return Table(MOTION_COLUMNS, rows)
 

@@ -116,7 +116,7 @@ def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:
         raise DataError(f'{directory}: cannot be read ({os_error_reason(error)})') from None
     if not names:
         raise DataError(f'{directory}: there is no calibration in this folder (no file *{SUFFIX})')
-    out = {}
+    calibrations = {}
     for name in names:
         path = os.path.join(directory, name)
         calibration = load_calibration(path)
@@ -126,8 +126,8 @@ def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:
                 f'{path}: this is the calibration of fluoroscope {calibration.fluoroscope}, '
                 f'its file is called {expected}'
             )
-        out[calibration.fluoroscope] = calibration
-    return out
+        calibrations[calibration.fluoroscope] = calibration
+    return calibrations
 
 
 def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
@@ -143,8 +143,8 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
             f'{limits.max_training_points} are not read'
         )
     # Points that coincide in single precision: a search tree cannot separate them.
-    heaps = np.unique(arrays['train_uv'].astype(np.float32), axis=0, return_counts=True)[1]
-    if heaps.max(initial=0) > MAX_COINCIDENT:
+    counts = np.unique(arrays['train_uv'].astype(np.float32), axis=0, return_counts=True)[1]
+    if counts.max(initial=0) > MAX_COINCIDENT:
         raise DataError(
             f'{where}: more than {MAX_COINCIDENT} training points lie on one place of the image'
         )
@@ -218,11 +218,11 @@ def load_orientation(path: PathLike) -> RigOrientation:
     """
     values = to_values(read_arrays(path, ORIENTATION_LAYOUT))
     identity = values.pop('orientation_id')
-    most = read_limits().max_fluoroscopes
-    if len(values['fluoroscope']) > most:
+    max_fluoroscopes = read_limits().max_fluoroscopes
+    if len(values['fluoroscope']) > max_fluoroscopes:
         raise DataError(
             f'{path}: the orientation has {len(values["fluoroscope"])} fluoroscopes, more than '
-            f'{most} are not read'
+            f'{max_fluoroscopes} are not read'
         )
     for name in values['fluoroscope'].tolist():
         check_safe_name(name, path)
@@ -235,25 +235,25 @@ def load_orientation(path: PathLike) -> RigOrientation:
             f'{path}: the content does not belong to its orientation_id {identity}, '
             f'the file was changed'
         )
-    present = _present_ids(path, orientation)
-    if present == orientation.calibration_ids:
+    present_ids = _present_ids(path, orientation)
+    if present_ids == orientation.calibration_ids:
         return orientation
-    return replace(orientation, calibration_ids=present)
+    return replace(orientation, calibration_ids=present_ids)
 
 
 def _present_ids(path: PathLike, orientation: RigOrientation) -> tuple[str, ...]:
     """Return the calibration ids of an orientation; replace those computed by earlier versions."""
     folder = os.path.dirname(os.path.abspath(path))
-    out = []
+    present_ids = []
     for name, identity in zip(orientation.fluoroscopes, orientation.calibration_ids):
-        present = identity
-        beside = calibration_path(folder, name)
-        if os.path.isfile(beside):
+        present_id = identity
+        calibration_file = calibration_path(folder, name)
+        if os.path.isfile(calibration_file):
             with suppress(DataError):  # reported where the calibration is used
-                calibration, stored = read_with_id(beside)
-                present = calibration.calibration_id if stored == identity else identity
-        out.append(present)
-    return tuple(out)
+                calibration, stored_id = read_with_id(calibration_file)
+                present_id = calibration.calibration_id if stored_id == identity else identity
+        present_ids.append(present_id)
+    return tuple(present_ids)
 
 
 RESULT_NAME = 'result.json'
@@ -283,12 +283,12 @@ def disagreements(directory: PathLike, calibrations: Calibrations) -> list[Findi
         verdict = read_result(directory, VALIDATION_NAME)
     except DataError as error:
         return [error.finding]
-    found = (
+    findings = (
         exchanged(directory, document, calibrations),
         edited(directory, document),
         changed_since_verdict(directory, verdict),
     )
-    return [one for one in found if one is not None]
+    return [finding for finding in findings if finding is not None]
 
 
 def read_result(directory: PathLike, name: str = RESULT_NAME) -> dict[str, Any]:
@@ -304,14 +304,16 @@ def used_exposures(document: Mapping[str, Any], frames: Frames) -> dict[str, set
     frames count as used.
     """
     entries = document.get('fluoroscopes')
-    out = {name: {int(frame.number) for frame in of_one} for name, of_one in frames.items()}
-    for name, numbers in out.items():
+    numbers_by_name = {
+        name: {int(frame.number) for frame in view_frames} for name, view_frames in frames.items()
+    }
+    for name, numbers in numbers_by_name.items():
         entry = entries.get(name) if isinstance(entries, Mapping) else None
         rows = entry.get('exposures') if isinstance(entry, Mapping) else None
         if isinstance(rows, list):
-            used = {row.get('exposure') for row in rows if isinstance(row, Mapping)}
-            out[name] = numbers & used or numbers
-    return out
+            used_numbers = {row.get('exposure') for row in rows if isinstance(row, Mapping)}
+            numbers_by_name[name] = numbers & used_numbers or numbers
+    return numbers_by_name
 
 
 def with_digests(
@@ -328,10 +330,10 @@ def with_digests(
 
 def changed_since_verdict(directory: PathLike, verdict: Mapping[str, Any]) -> Finding | None:
     """Return a finding if a verdict, or a file that it is about, was changed afterwards."""
-    found = edited(directory, verdict, VALIDATION_NAME)
+    finding = edited(directory, verdict, VALIDATION_NAME)
     files = verdict.get(FILES)
-    if found is not None or not isinstance(files, Mapping):
-        return found
+    if finding is not None or not isinstance(files, Mapping):
+        return finding
     try:
         changed = [n for n in files if _digest_of_file(Path(directory) / n) != files[n]]
     except DataError as error:
@@ -357,13 +359,15 @@ def stored_verdict(directory: PathLike) -> Verdict:
     if not document:
         return Verdict()
     identity = document.get('calibration_id')
-    about = {str(k): str(v) for k, v in identity.items()} if isinstance(identity, Mapping) else {}
+    calibration_ids = (
+        {str(k): str(v) for k, v in identity.items()} if isinstance(identity, Mapping) else {}
+    )
     changed = changed_since_verdict(directory, document)
     if changed is not None:
-        return Verdict('cannot tell', (str(changed),), about)
+        return Verdict('cannot tell', (str(changed),), calibration_ids)
     findings = document.get('findings')
-    told = tuple(map(str, findings)) if isinstance(findings, list) else ()
-    return Verdict(str(document.get('verdict', 'cannot tell')), told, about)
+    reasons = tuple(map(str, findings)) if isinstance(findings, list) else ()
+    return Verdict(str(document.get('verdict', 'cannot tell')), reasons, calibration_ids)
 
 
 def _digest_of_file(path: Path) -> str:
@@ -385,19 +389,19 @@ def exchanged(
     entries = document.get('fluoroscopes')
     if not isinstance(entries, Mapping):
         return None
-    wrong = []
+    mismatched = []
     for name, calibration in calibrations.items():
         entry = entries.get(name)
-        stated = entry.get('calibration_id') if isinstance(entry, Mapping) else None
-        if stated is not None and stated != calibration.calibration_id:
-            wrong.append(name)
-    if not wrong:
+        stated_id = entry.get('calibration_id') if isinstance(entry, Mapping) else None
+        if stated_id is not None and stated_id != calibration.calibration_id:
+            mismatched.append(name)
+    if not mismatched:
         return None
     return Finding(
         Kind.EXCHANGED_CALIBRATION,
-        f'the calibration file{"s" * (len(wrong) > 1)} of {", ".join(wrong)} and '
+        f'the calibration file{"s" * (len(mismatched) > 1)} of {", ".join(mismatched)} and '
         f'{RESULT_NAME} are of different calibrations',
-        Place(tuple(wrong), name=str(directory)),
+        Place(tuple(mismatched), name=str(directory)),
         'one of them was exchanged; restore the files of one calibration, or calibrate again',
         Severity.WARNING,
     )

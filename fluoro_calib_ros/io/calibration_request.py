@@ -100,18 +100,18 @@ def read_request(
                 f'{where}: these are not the observations and the phantom from which the '
                 f'calibration of fluoroscope {name} was made'
             )
-    used = {name: frames[name] for name in calibrations}
+    calibrated_frames = {name: frames[name] for name in calibrations}
     names = read_names(directory)
     path = directory / KNOWN_ORIENTATION
-    known = read_known_orientations(path) if path.exists() else {}
+    known_orientations = read_known_orientations(path) if path.exists() else {}
     return CalibrationRequest(
-        used,
+        calibrated_frames,
         phantom,
         options=options,
         joint=joint,
         principal_distance=distance,
         names=names,
-        known_orientations=known,
+        known_orientations=known_orientations,
     )
 
 
@@ -121,9 +121,9 @@ def _require_file(path: Path, option: str = '') -> Path:
     option: command-line option that can be given instead.
     """
     if not path.exists():
-        instead = f'give {option}, or calibrate again' if option else 'calibrate again'
+        remedy = f'give {option}, or calibrate again' if option else 'calibrate again'
         raise DataError(
-            f'{path}: there is no such file, the calibration was written without it: {instead}'
+            f'{path}: there is no such file, the calibration was written without it: {remedy}'
         )
     return path
 
@@ -132,14 +132,16 @@ def read_calibrated_frames(directory: Path, calibrations: Calibrations) -> dict[
     """Read the frames from which the calibrations in a folder were made. Raises DataError."""
     path = directory / OBSERVATIONS
     widths, heights = zip(*(c.image_size for c in calibrations.values()))
-    found = read_observations_csv(_require_file(path, '--source'), (max(widths), max(heights)))
+    all_frames = read_observations_csv(
+        _require_file(path, '--source'), (max(widths), max(heights))
+    )
     frames: dict[str, list[Frame]] = {}
-    for name, of_fluoroscope in found.items():
+    for name, view_frames in all_frames.items():
         if name in calibrations:
             size = calibrations[name].image_size
-            frames[name] = [replace(frame, image_size=size) for frame in of_fluoroscope]
-    for of_fluoroscope in frames.values():
-        for frame in of_fluoroscope:
+            frames[name] = [replace(frame, image_size=size) for frame in view_frames]
+    for view_frames in frames.values():
+        for frame in view_frames:
             with ErrorsAt(path):
                 validate_frame(frame)
     return frames
@@ -181,9 +183,9 @@ def write_radiographs(directory: PathLike, radiographs: Radiographs) -> None:
     """Write the radiographs of a result into its folder. Raises DataError."""
     if any(radiographs.values()):
         make_folder(Path(directory) / RADIOGRAPHS)
-    for name, of_exposures in radiographs.items():
+    for name, view_radiographs in radiographs.items():
         check_safe_name(name, directory)
-        for exposure, content in of_exposures.items():
+        for exposure, content in view_radiographs.items():
             write_bytes(_path(directory, name, exposure), content)
 
 
@@ -194,7 +196,7 @@ def read_radiographs(
 
     Raises DataError for a file that is too large or not a JPEG.
     """
-    found: dict[str, dict[int, bytes]] = {}
+    radiographs: dict[str, dict[int, bytes]] = {}
     for name, exposure in wanted:
         path = _path(directory, name, exposure)
         if not path.is_file():
@@ -204,8 +206,8 @@ def read_radiographs(
         content = read_bytes(path)
         if not content.startswith(JPEG_START):
             raise DataError(f'{path}: this is no JPEG image')
-        found.setdefault(name, {})[exposure] = content
-    return found
+        radiographs.setdefault(name, {})[exposure] = content
+    return radiographs
 
 
 def _path(directory: PathLike, name: str, exposure: int) -> Path:

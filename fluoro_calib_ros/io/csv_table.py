@@ -102,10 +102,10 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
     text = read_text(path)
     check_rows(text, MAX_ROWS_CSV, path)
     rows = _numbered_rows(path, text)
-    line, first = next(rows, (0, []))
-    if not first:
+    line, first_row = next(rows, (0, []))
+    if not first_row:
         raise DataError(f'{path}: the file has no header, {",".join(required)} is expected')
-    header = [name.strip() for name in first]
+    header = [name.strip() for name in first_row]
     _check_header(f'{path}, row {line}', header, required)
     is_empty = True
     while block := list(islice(rows, BLOCK)):
@@ -128,8 +128,8 @@ def decimal_point(cell: str) -> str:
     """Replace the decimal comma of a number by a point; return any other cell unchanged."""
     if cell.count(',') != 1 or '.' in cell:
         return cell
-    changed = cell.replace(',', '.')
-    return changed if is_number(changed) else cell
+    with_point = cell.replace(',', '.')
+    return with_point if is_number(with_point) else cell
 
 
 @dataclass(frozen=True)
@@ -180,8 +180,8 @@ _SUSPICIOUS = _FORMULA | {"'"}
 
 def as_text(cell: str) -> str:
     """Return a cell, with a leading apostrophe if a spreadsheet would evaluate it as a formula."""
-    bare = cell.lstrip("'")
-    return f"'{cell}" if bare[:1] in _FORMULA and not is_number(bare) else cell
+    unquoted = cell.lstrip("'")
+    return f"'{cell}" if unquoted[:1] in _FORMULA and not is_number(unquoted) else cell
 
 
 def _as_texts(row: Iterable[Any]) -> list[Any]:
@@ -212,12 +212,12 @@ def _numbered_rows(path: PathLike, text: str) -> Iterator[tuple[int, list[str]]]
         lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
     reader = csv.reader(lines, delimiter=separator, strict=True)
     has_commas = separator == ';'
-    before = 0
+    last_line = 0
     try:
         for row in reader:
             if len(row) > 1 or (row and row[0].strip()):
-                yield before + 1, [decimal_point(c.strip()) for c in row] if has_commas else row
-            before = reader.line_num
+                yield last_line + 1, [decimal_point(c.strip()) for c in row] if has_commas else row
+            last_line = reader.line_num
     except csv.Error as error:
         raise DataError(f'{path}, row {reader.line_num}: this is not CSV ({error})') from None
 
@@ -349,13 +349,13 @@ def read_names(directory: PathLike) -> Names:
     path = Path(directory) / NAMES_FILE
     if not path.exists():
         return Names()
-    found: dict[str, dict[str, Any]] = {attribute: {} for attribute in _KINDS.values()}
+    tables: dict[str, dict[str, Any]] = {attribute: {} for attribute in _KINDS.values()}
     for block in read_blocks(path, COLUMNS):
         columns = zip(*(block.strings(name) for name in COLUMNS))
         for index, (kind, identity, name) in enumerate(columns):
             if kind not in _KINDS:
                 block.fail(index, f'kind is {kind!r}, not {", ".join(_KINDS)}')
-            table = found[_KINDS[kind]]
+            table = tables[_KINDS[kind]]
             value: Any = identity
             if kind == 'fluoroscope':
                 check_safe_name(identity, f'{path}, row {block.lines[index]}')
@@ -368,4 +368,4 @@ def read_names(directory: PathLike) -> Names:
             if name in table or value in table.values():
                 block.fail(index, f'the {kind} {name!r}, id {identity}, is given twice')
             table[name] = value
-    return Names(**found)
+    return Names(**tables)

@@ -30,19 +30,19 @@ def doubtful_table(doubtful: Iterable[Doubtful], names: Names | None = None) -> 
     fluoroscopes = names.fluoroscope_names()
 
     def rows() -> Iterator[list[Any]]:
-        for one in doubtful:
+        for point in doubtful:
             target: Any = (
-                '' if one.target_id is None else targets.get(one.target_id, one.target_id)
+                '' if point.target_id is None else targets.get(point.target_id, point.target_id)
             )
             yield [
-                fluoroscopes.get(one.fluoroscope, one.fluoroscope),
-                exposures.get(one.first, one.first),
-                exposures.get(one.last, one.last),
+                fluoroscopes.get(point.fluoroscope, point.fluoroscope),
+                exposures.get(point.first, point.first),
+                exposures.get(point.last, point.last),
                 target,
-                *(one.uv or (float('nan'),) * 2),
-                one.residual_px,
-                ' '.join(str(targets.get(i, i)) for i in one.others),
-                one.reason,
+                *(point.uv or (float('nan'),) * 2),
+                point.residual_px,
+                ' '.join(str(targets.get(i, i)) for i in point.others),
+                point.reason,
                 '',
             ]
 
@@ -55,12 +55,12 @@ def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
     names: names of fluoroscopes, exposures and targets that the table may contain. Raises
     DataError that names the row, for a decision that is neither 'leave out' nor a target.
     """
-    out = []
+    decisions = []
     for block in read_blocks(path, REQUIRED):
-        known = [name for name in (*REQUIRED, 'last_exposure') if name in block]
-        columns = {name: block.strings(name) for name in known}
-        for index, given in enumerate(columns['decision']):
-            words = ' '.join(given.replace('_', ' ').lower().split())
+        column_names = [name for name in (*REQUIRED, 'last_exposure') if name in block]
+        columns = {name: block.strings(name) for name in column_names}
+        for index, decision in enumerate(columns['decision']):
+            words = ' '.join(decision.replace('_', ' ').lower().split())
             if not words:
                 continue
             row = {name: cells[index].strip() for name, cells in columns.items()}
@@ -75,7 +75,7 @@ def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
             if row['target_id']:
                 target = _number(block, index, row, 'target_id', names.targets)
             name = row['fluoroscope']
-            out.append(
+            decisions.append(
                 PointDecision(
                     f'{path}, row {block.lines[index]}',
                     names.fluoroscopes.get(name, name),
@@ -85,7 +85,7 @@ def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
                     new_id=new_id,
                 )
             )
-    return out
+    return decisions
 
 
 def _new_id(block: Block, index: int, row: Mapping[str, str], names: Names) -> int:

@@ -130,10 +130,10 @@ def check_budget(kind: str, text: str, where: object) -> None:
 
 
 def _check_size(kind: str, text: str, where: object) -> None:
-    most = DOCUMENT_BYTES[kind]
-    if len(text) > most:
+    limit = DOCUMENT_BYTES[kind]
+    if len(text) > limit:
         raise DataError(
-            f'{where}: the {kind} text has {len(text) / 1e6:.1f} MB, more than {most / 1e6:g} MB '
+            f'{where}: the {kind} text has {len(text) / 1e6:.1f} MB, more than {limit / 1e6:g} MB '
             'are not read'
         )
 

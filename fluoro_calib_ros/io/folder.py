@@ -72,15 +72,16 @@ def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathL
     target = os.path.realpath(path)
     if os.path.lexists(target) and not os.path.isdir(target):
         raise DataError(f'{path}: this is {_what(target)}, not a folder; choose another output')
-    for each in inputs:
-        source = os.path.realpath(each)
+    for input_path in inputs:
+        source = os.path.realpath(input_path)
         if target == source or source.startswith(os.path.join(target, '')):
             raise DataError(
-                f'{path}: the input {each} would be overwritten, choose another output folder'
+                f'{path}: the input {input_path} would be overwritten, choose another output '
+                'folder'
             )
         if target.startswith(os.path.join(source, '')):
             raise DataError(
-                f'{path}: the output lies in the input {each}, choose another output folder'
+                f'{path}: the output lies in the input {input_path}, choose another output folder'
             )
     for folder in (target, target + PREVIOUS):
         _check_kind(folder, kind)
@@ -95,13 +96,13 @@ def check_output_file(path: PathLike, inputs: Iterable[PathLike] = ()) -> None:
     target = os.path.realpath(path)
     if os.path.lexists(target) and not os.path.isfile(target):
         raise DataError(f'{path}: this is {_what(target)}, not a file; choose another output')
-    for each in inputs:
-        source = os.path.realpath(each)
+    for input_path in inputs:
+        source = os.path.realpath(input_path)
         name = os.path.basename(target)
         is_part = os.path.dirname(target) == source and name.endswith(_INPUT_NAMES)
         if os.path.exists(target) and (is_part or _is_same(target, source)):
             raise DataError(
-                f'{path}: the input {each} would be overwritten, choose another output file'
+                f'{path}: the input {input_path} would be overwritten, choose another output file'
             )
 
 
@@ -214,10 +215,10 @@ def _put_in_place(staging: str, target: str) -> None:
         except OSError as error:
             if error.errno not in _NO_EXCHANGE:
                 raise
-            old = _hidden(target, 'old')
-            os.rename(target, old)
+            backup = _hidden(target, 'old')
+            os.rename(target, backup)
             os.rename(complete, target)
-            complete = old
+            complete = backup
     except OSError:
         _delete(complete)
         raise
@@ -251,12 +252,12 @@ def _exchange(first: str, second: str) -> None:
 
 def _move_entries(staging: str, target: str, kind: FolderKind) -> None:
     """Move new entries one by one into a folder that must stay in place."""
-    new = set(os.listdir(staging))
+    new_names = set(os.listdir(staging))
     for name in os.listdir(target):
         path = os.path.join(target, name)
-        if path != staging and kind.owns(name) and (name not in new or os.path.isdir(path)):
+        if path != staging and kind.owns(name) and (name not in new_names or os.path.isdir(path)):
             _delete(path)
-    for name in sorted(new):
+    for name in sorted(new_names):
         os.replace(os.path.join(staging, name), os.path.join(target, name))
     os.rmdir(staging)
     sync_folder(target)
@@ -310,14 +311,14 @@ def _leftovers(folder: str, name: str) -> list[str]:
     if not os.path.isdir(folder):
         return []
     start = f'.{name[:100]}.'
-    found = []
+    leftovers = []
     for entry in sorted(os.listdir(folder)):
         mark, _, suffix = entry.removeprefix(start).partition('.')
         if entry.startswith(start) and mark.isalnum() and suffix in ('tmp', 'swap', 'old'):
             path = os.path.join(folder, entry)
             if os.path.isdir(path) and not os.path.islink(path):
-                found.append(path)
-    return found
+                leftovers.append(path)
+    return leftovers
 
 
 def _hidden(target: str, suffix: str) -> str:

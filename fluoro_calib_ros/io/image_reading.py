@@ -44,8 +44,8 @@ def read_image_angles(path: PathLike) -> dict[int, float]:
         numbers = block.ids('image')
         block.require('image', numbers > 0, 'the first image is 1')
         degrees = block.floats_or_nan('angle_deg')
-        possible = np.isnan(degrees) | (np.abs(degrees) <= np.degrees(MAX_ANGLE))
-        block.require('angle_deg', possible, 'not an angle')
+        valid = np.isnan(degrees) | (np.abs(degrees) <= np.degrees(MAX_ANGLE))
+        block.require('angle_deg', valid, 'not an angle')
         for index, (number, angle) in enumerate(zip(numbers.tolist(), np.radians(degrees))):
             if number in rows:
                 block.fail(index, f'image {number} is in row {rows[number]}, too')
@@ -101,15 +101,15 @@ def image_suffix_of(path: PathLike) -> str:
     suffix = suffix_of(path)
     if suffix in READ_SUFFIXES:
         return suffix
-    known = suffix and not suffix[1:].isdigit()
-    if known or not os.path.isfile(path) or Path(path).name == _DIRECTORY:
+    has_other_suffix = suffix and not suffix[1:].isdigit()
+    if has_other_suffix or not os.path.isfile(path) or Path(path).name == _DIRECTORY:
         return ''
     try:
         with open(path, 'rb') as file:
-            begin = file.read(132)
+            head = file.read(132)
     except OSError:
         return ''
-    return next((s for at, mark, s in _BEGINNINGS if begin[at:].startswith(mark)), '')
+    return next((s for at, mark, s in _BEGINNINGS if head[at:].startswith(mark)), '')
 
 
 def is_image_source(path: PathLike) -> bool:
@@ -243,22 +243,22 @@ def _read_image(path: Path) -> Iterator[tuple[str, np.ndarray]]:
 
 def _read_pages(path: Path, pages: int) -> Iterator[tuple[str, np.ndarray]]:
     """Read the pages of a stack in batches: OpenCV scans the file from its start for each call."""
-    done = 0
+    count = 0
     batch = 1
-    while done < pages:
-        wanted = min(batch, pages - done)
+    while count < pages:
+        batch_size = min(batch, pages - count)
         try:
-            ok, images = cv2.imreadmulti(str(path), done, wanted, flags=cv2.IMREAD_UNCHANGED)
+            ok, images = cv2.imreadmulti(str(path), count, batch_size, flags=cv2.IMREAD_UNCHANGED)
         except cv2.error:
             ok = False
             images = ()
-        if not ok or len(images) != wanted:
+        if not ok or len(images) != batch_size:
             raise DataError(
-                f'page {done + len(images) + 1} of {pages} is damaged or cut off', at=path
+                f'page {count + len(images) + 1} of {pages} is damaged or cut off', at=path
             )
         for image in images:
-            done += 1
-            where = f'{path}, page {done}'
+            count += 1
+            where = f'{path}, page {count}'
             with ErrorsAt(where):
                 yield where, as_grey(image)
         batch = max(1, MAX_BATCH_BYTES // images[0].nbytes)

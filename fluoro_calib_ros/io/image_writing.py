@@ -57,12 +57,12 @@ def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
     if suffix in STACK_SUFFIXES:
         return _write_stack(out, source, progress)
     if source.kind != 'image':
-        possible: tuple[str, ...] = STACK_SUFFIXES
+        suffixes: tuple[str, ...] = STACK_SUFFIXES
         if source.kind == 'video':
-            possible = (*STACK_SUFFIXES, *VIDEO_CODECS)
+            suffixes = (*STACK_SUFFIXES, *VIDEO_CODECS)
         raise DataError(
             f'{out}: a {source.kind} cannot be written as {suffix or "a file without ending"}, '
-            f'use {listed(possible)}'
+            f'use {listed(suffixes)}'
         )
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(
@@ -83,10 +83,10 @@ CLASSIC_BYTES = 4 * 10**9  # larger files need 64-bit offsets; includes a reserv
 def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
     """Write an uncompressed TIFF file, page by page; return the number of pages."""
     _, image = next(source.images)
-    large = max(source.count, 1) * (image.nbytes + 1024) > CLASSIC_BYTES  # 1024: page header
+    is_big = max(source.count, 1) * (image.nbytes + 1024) > CLASSIC_BYTES  # 1024: page header
     with (
         atomic_file(out) as file,
-        TiffWriter(file, bigtiff=large, byteorder='<') as writer,
+        TiffWriter(file, bigtiff=is_big, byteorder='<') as writer,
     ):
         page = {'photometric': 'minisblack', 'metadata': None, 'contiguous': False}
         write = partial(writer.write, software=False, **page)
@@ -214,8 +214,8 @@ def correct_images(
     images = open_images(source)
     correctors = (lambda number: corrector) if isinstance(corrector, ImageCorrector) else corrector
     corrected = replace(images, images=_corrected_images(images, correctors))
-    written = write_images(out, corrected, progress or (lambda done, total: None))
-    return CorrectedImages(images.kind, written)
+    count = write_images(out, corrected, progress or (lambda done, total: None))
+    return CorrectedImages(images.kind, count)
 
 
 def check_apart(source: Path, out: Path) -> None:
@@ -230,14 +230,14 @@ def _corrected_images(
     source: ImageSource, correctors: Correctors
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the corrected images; all of them share one array."""
-    out = None
+    buffer = None
     for number, (where, image) in enumerate(source.images, 1):
         corrector = correctors(number)
         with ErrorsAt(where):
             corrector.check(image)
-        if out is None or out.dtype != image.dtype:
-            out = np.empty(corrector.shape, dtype=image.dtype)
-        yield where, corrector.correct(image, out)
+        if buffer is None or buffer.dtype != image.dtype:
+            buffer = np.empty(corrector.shape, dtype=image.dtype)
+        yield where, corrector.correct(image, buffer)
 
 
 # Folders of images and videos, and output folders with the same structure.
@@ -263,10 +263,10 @@ class ImageFolder:
 
     def _written(self, path: Path) -> Path:
         suffix = image_suffix_of(self.path / path)
-        new = _WRITTEN_AS.get(suffix, suffix)
+        new_suffix = _WRITTEN_AS.get(suffix, suffix)
         if suffix_of(path) == suffix:
-            return path.with_suffix(new if suffix in _WRITTEN_AS else path.suffix)
-        return path.with_name(path.name + new)  # its format was recognised by content
+            return path.with_suffix(new_suffix if suffix in _WRITTEN_AS else path.suffix)
+        return path.with_name(path.name + new_suffix)  # its format was recognised by content
 
 
 def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
@@ -274,24 +274,24 @@ def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
 
     Raises DataError if there are none, or if two would be written under the same name.
     """
-    found = (path for path in folder.rglob('*')) if recursive else folder.iterdir()
-    files = sorted(path.relative_to(folder) for path in found if path.is_file())
+    paths = (path for path in folder.rglob('*')) if recursive else folder.iterdir()
+    files = sorted(path.relative_to(folder) for path in paths if path.is_file())
     images = tuple(path for path in files if image_suffix_of(folder / path))
     if not images:
         raise DataError(
             f'{folder}: there are no images in this folder ({listed(IMAGE_SUFFIXES)}), and no '
             'videos'
         )
-    others = tuple(str(path) for path in files if path not in set(images))
-    out = ImageFolder(folder, images, others, recursive)
+    other_files = tuple(str(path) for path in files if path not in set(images))
+    image_folder = ImageFolder(folder, images, other_files, recursive)
     by_name: dict[Path, Path] = {}
-    for path, name in zip(images, out.written):
+    for path, name in zip(images, image_folder.written):
         if name in by_name:
             raise DataError(
                 f'{folder}: {by_name[name]} and {path} would both be written as {name}, rename one'
             )
         by_name[name] = path
-    return out
+    return image_folder
 
 
 @contextmanager

@@ -133,12 +133,12 @@ def _read(
     )
     names = columns.fluoroscopes()
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(names)}
-    for number, of_frame in enumerate(_by_frame(rows, names)):
+    for number, frame_rows in enumerate(_by_frame(rows, names)):
         if number == MAX_FRAMES:
             raise DataError(f'{path}: more than {MAX_FRAMES} frames are not read')
-        name = names[of_frame.code[0]]
-        frames[name].append(_frame(path, name, of_frame, image_size))
-    return {name: of_one for name, of_one in frames.items() if of_one}, stray
+        name = names[frame_rows.code[0]]
+        frames[name].append(_frame(path, name, frame_rows, image_size))
+    return {name: view_frames for name, view_frames in frames.items() if view_frames}, stray
 
 
 def _on_image(
@@ -149,19 +149,19 @@ def _on_image(
     The sentence names the first excluded point and counts the others. Raises DataError if
     leave_out is false or too many points are off the image.
     """
-    off = ~points_on_image(rows.uv, image_size)
-    if not off.any():
+    is_off = ~points_on_image(rows.uv, image_size)
+    if not is_off.any():
         return rows, ''
-    first = int(np.argmax(off))
-    u, v = rows.uv[first]
+    row = int(np.argmax(is_off))
+    u, v = rows.uv[row]
     sentence = (
-        f'{path}, row {rows.line[first]}: the point ({u:g}, {v:g}) is off the image of '
+        f'{path}, row {rows.line[row]}: the point ({u:g}, {v:g}) is off the image of '
         f'{image_size[0]} x {image_size[1]} px'
     )
-    if not leave_out or not few(int(off.sum()), len(off)):
+    if not leave_out or not few(int(is_off.sum()), len(is_off)):
         raise DataError(sentence)
-    more = f', and {off.sum() - 1} more' if off.sum() > 1 else ''
-    return rows[~off], f'not used: {sentence}{more}'
+    addition = f', and {is_off.sum() - 1} more' if is_off.sum() > 1 else ''
+    return rows[~is_off], f'not used: {sentence}{addition}'
 
 
 def write_observations_csv(
@@ -178,7 +178,7 @@ def write_observations_csv(
     column. Raises DataError if the file cannot be written.
     """
     if isinstance(frames, Mapping):
-        frames = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+        frames = [frame for view_frames in frames.values() for frame in view_frames]
     frames = list(frames)
     for frame in frames:
         check_safe_name(frame.fluoroscope, path)
@@ -208,12 +208,12 @@ def corrections_of(path: PathLike) -> dict[str, str]:
 
     Returns {} for observed, uncorrected points. Raises DataError.
     """
-    found: dict[str, str] = {}
+    corrections: dict[str, str] = {}
     for block in read_blocks(path, COLUMNS):
         if CORRECTED_BY not in block:
             return {}
-        found |= dict(zip(block.strings('fluoroscope'), block.strings(CORRECTED_BY)))
-    return {name: identity for name, identity in found.items() if identity}
+        corrections |= dict(zip(block.strings('fluoroscope'), block.strings(CORRECTED_BY)))
+    return {name: identity for name, identity in corrections.items() if identity}
 
 
 @dataclass(frozen=True)
@@ -287,8 +287,8 @@ def _by_frame(rows: _Rows, names: Sequence[str]) -> Iterator[_Rows]:
     new_code = np.diff(ordered.code, prepend=-1)
     new_exposure = np.diff(ordered.exposure, prepend=-1)
     starts = np.flatnonzero(new_code | new_exposure)
-    for of_frame in np.split(order, starts[1:]):
-        yield rows[of_frame]
+    for indices in np.split(order, starts[1:]):
+        yield rows[indices]
 
 
 def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) -> Frame:
@@ -301,9 +301,9 @@ def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) 
             f'{path}, row {rows.line[second]}: target {rows.target_id[second]} {where} is already '
             f'given in row {rows.line[first]}'
         )
-    unknown = np.isnan(rows.sigma)
-    if unknown.any() and not unknown.all():
-        row = np.argmax(unknown)
+    without_sigma = np.isnan(rows.sigma)
+    if without_sigma.any() and not without_sigma.all():
+        row = np.argmax(without_sigma)
         raise DataError(
             f'{path}, row {rows.line[row]}: sigma of target {rows.target_id[row]} {where} is '
             f'empty, but other targets of this exposure have one'
@@ -315,7 +315,7 @@ def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) 
         target_id=rows.target_id,
         uv=rows.uv,
         image_size=(int(width), int(height)),
-        sigma=None if unknown.all() else rows.sigma,
+        sigma=None if without_sigma.all() else rows.sigma,
         frame_id=f'{name}_optical',
         angle=_angle(path, where, rows),
     )
@@ -435,8 +435,8 @@ def points_of_frames(path: PathLike, frames: Frames, names: Names) -> PointsFile
     """
     exposures = names.exposure_names()
     targets = names.target_names()
-    flat = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
-    if not flat:
+    all_frames = [frame for view_frames in frames.values() for frame in view_frames]
+    if not all_frames:
         raise DataError(f'{path}: the file has no image points')
     rows = [
         [
@@ -445,7 +445,7 @@ def points_of_frames(path: PathLike, frames: Frames, names: Names) -> PointsFile
             str(targets.get(i, i)),
             *map(repr, uv),
         ]
-        for f in flat
+        for f in all_frames
         for i, uv in zip(f.target_id.tolist(), f.uv.tolist())
     ]
     return PointsFile(
@@ -453,10 +453,12 @@ def points_of_frames(path: PathLike, frames: Frames, names: Names) -> PointsFile
         header=['fluoroscope', 'exposure', 'target_id', 'u', 'v'],
         rows=rows,
         lines=np.arange(2, len(rows) + 2),
-        uv=np.concatenate([f.uv for f in flat]),
+        uv=np.concatenate([f.uv for f in all_frames]),
         sigma=None,
         fluoroscope=np.array([row[0] for row in rows]),
-        angle=np.concatenate([np.repeat(a, len(f.uv)) for f, a in zip(flat, angles_of(flat))]),
+        angle=np.concatenate(
+            [np.repeat(a, len(f.uv)) for f, a in zip(all_frames, angles_of(all_frames))]
+        ),
     )
 
 
@@ -525,14 +527,14 @@ def correct_points(
                 f'of {", ".join(calibrations)}'
             )
         names = np.array([*calibrations] * len(points.uv))
-    unknown = np.flatnonzero(~np.isin(names, list(calibrations)))
-    if len(unknown):
-        first = unknown[0]
+    without_calibration = np.flatnonzero(~np.isin(names, list(calibrations)))
+    if len(without_calibration):
+        first_row = without_calibration[0]
         raise DataError(
-            f'{points.path}, row {points.lines[first]}: there is no calibration of fluoroscope '
-            f'{str(names[first])!r}, only of {", ".join(calibrations)}'
+            f'{points.path}, row {points.lines[first_row]}: there is no calibration of '
+            f'fluoroscope {str(names[first_row])!r}, only of {", ".join(calibrations)}'
         )
-    out = CorrectedPoints(
+    corrected = CorrectedPoints(
         np.full(points.uv.shape, np.nan),
         np.full(len(names), np.nan),
         np.full(len(names), CorrectionStatus.INVALID, dtype=np.uint8),
@@ -548,11 +550,11 @@ def correct_points(
         angles = np.full(len(rows), np.nan if points.angle is None else points.angle[rows])
         if angle is not None:
             angles[np.isnan(angles)] = angle
-        part = calibration.correct(points.uv[rows], sigma, angle=angles)
-        out.uv[rows] = part.uv
-        out.sigma[rows] = part.sigma
-        out.status[rows] = part.status
-    return out
+        view_points = calibration.correct(points.uv[rows], sigma, angle=angles)
+        corrected.uv[rows] = view_points.uv
+        corrected.sigma[rows] = view_points.sigma
+        corrected.status[rows] = view_points.status
+    return corrected
 
 
 def write_points(path: PathLike, points: PointsFile, corrected: CorrectedPoints) -> None:

@@ -42,9 +42,9 @@ def _read(path: PathLike, column: NamedColumn) -> Phantom:
     rows = read_all(path, COLUMNS)
     numbers = _numbers(rows)
     ids = column.numbers(column.read(rows))
-    most = read_limits().max_targets
-    if len(ids) > most:
-        raise DataError(f'{path}: phantoms of more than {most} targets are not read')
+    max_targets = read_limits().max_targets
+    if len(ids) > max_targets:
+        raise DataError(f'{path}: phantoms of more than {max_targets} targets are not read')
     diameters = None
     if DIAMETER in rows:
         diameters = rows.floats(DIAMETER)

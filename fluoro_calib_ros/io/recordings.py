@@ -182,13 +182,13 @@ def _grey(frame: np.ndarray, header: DicomHeader) -> np.ndarray:
     """Convert to grey values that start at 0 and increase with brightness."""
     if frame.shape != header.shape:
         raise ValueError
-    full = 2**header.bits - 1
+    max_value = 2**header.bits - 1
     values = frame.astype(np.int32)
     if header.signed:
-        values += (full + 1) // 2
-    values &= full  # unused bits may contain an overlay
+        values += (max_value + 1) // 2
+    values &= max_value  # unused bits may contain an overlay
     if header.inverted:
-        values = full - values
+        values = max_value - values
     return values.astype(np.uint8 if header.bits <= 8 else np.uint16)
 
 
@@ -267,11 +267,11 @@ def _cine_header(file: BinaryIO, size: int) -> CineHeader:
         offsets=offsets,
         frame_rate=rate,
     )
-    needed = ANNOTATION + header.image_bytes
-    inside = (offsets >= FILE_HEADER.size) & (offsets <= size - needed)
-    if not inside.all():
+    bytes_needed = ANNOTATION + header.image_bytes
+    valid = (offsets >= FILE_HEADER.size) & (offsets <= size - bytes_needed)
+    if not valid.all():
         raise DataError(
-            f'the cine file is damaged or cut off: only {int(inside.sum())} of {count} images are '
+            f'the cine file is damaged or cut off: only {int(valid.sum())} of {count} images are '
             'in it'
         )
     return header

@@ -61,9 +61,10 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
         ],
         'relative_orientation': _relative(job.relative),
         'outliers': {'image_points': list(job.outliers[0]), 'targets': list(job.outliers[1])},
-        'adjustments': [_statistics(one) for one in job.statistics],
+        'adjustments': [_statistics(statistics) for statistics in job.statistics],
         'correlations': [
-            {'unknowns': [one, other], 'value': value} for one, other, value in job.correlations
+            {'unknowns': [first, second], 'value': value}
+            for first, second, value in job.correlations
         ],
         'history': _history(job.history),
         'converged': job.converged,
@@ -71,7 +72,7 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
         'seconds': job.seconds,
         'doubts': sentences(job.findings, Severity.ERROR),
         'rig_note': '; '.join(sentences(job.findings, Severity.WARNING)),
-        'findings': [finding_document(found) for found in job.findings],
+        'findings': [finding_document(finding) for finding in job.findings],
     }
 
 
@@ -120,7 +121,7 @@ def _statistics(statistics: AdjustmentStatistics) -> dict[str, Any]:
 
 def _relative(orientations: Sequence[RelativeOrientation]) -> Any:
     """Return the relative orientation of two fluoroscopes, a list for more, None for none."""
-    out = [
+    documents = [
         {
             'fluoroscopes': list(o.fluoroscopes),
             'quaternion_wxyz': quaternion_from_matrix(o.pose.rotation),
@@ -134,9 +135,9 @@ def _relative(orientations: Sequence[RelativeOrientation]) -> Any:
         }
         for o in orientations
     ]
-    if not out:
+    if not documents:
         return None
-    return out[0] if len(out) == 1 else out
+    return documents[0] if len(documents) == 1 else documents
 
 
 def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
@@ -164,11 +165,11 @@ def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
 def _noise(calibration: FluoroscopeCalibration) -> dict[str, float]:
     """Return the noise of an image coordinate [px], with middle and rim if it depends on place."""
     profile = calibration.noise_profile
-    out = {'sd': calibration.image_sd}
+    noise = {'sd': calibration.image_sd}
     if profile is not None:
         factors = {'middle': profile.middle, 'rim': profile.rim}
-        out |= {name: calibration.image_sd * factor for name, factor in factors.items()}
-    return out
+        noise |= {name: calibration.image_sd * factor for name, factor in factors.items()}
+    return noise
 
 
 def _angle(calibration: FluoroscopeCalibration) -> dict[str, Any]:
@@ -227,7 +228,7 @@ def drift_document(verdict: DriftVerdict | None, begin_ns: int) -> dict[str, Any
     """Return a DriftVerdict as a dict; times [s] are relative to the exposure at begin_ns."""
     if verdict is None:
         return None
-    out = {
+    document = {
         'kind': verdict.finding.kind.value,
         'level': verdict.level,
         'message': verdict.message,
@@ -238,11 +239,11 @@ def drift_document(verdict: DriftVerdict | None, begin_ns: int) -> dict[str, Any
         *('fluoroscope', 'place', 'area_px', 'size_px', 'sd_px', 'direction', 'against', 'source'),
         *('evidence', 'threshold_warn', 'threshold_error', 'observations'),
     ):
-        out[key] = getattr(verdict.state, key.removesuffix('_px')) if verdict.state else None
+        document[key] = getattr(verdict.state, key.removesuffix('_px')) if verdict.state else None
     for key, stamp_ns in (('found', verdict.found_ns), ('began', verdict.began_ns)):
-        out[f'{key}_stamp_ns'] = stamp_ns
-        out[f'{key}_s'] = None if stamp_ns is None else (stamp_ns - begin_ns) / 1e9
-    return out
+        document[f'{key}_stamp_ns'] = stamp_ns
+        document[f'{key}_s'] = None if stamp_ns is None else (stamp_ns - begin_ns) / 1e9
+    return document
 
 
 def validation_document(validation: Validation) -> dict[str, Any]:
@@ -346,22 +347,26 @@ def _fit_of_exposure(table: ResidualTable | None, name: str, exposure: int) -> l
     """Return image points, outliers and RMSE [px] of the inliers; blanks without a table."""
     if table is None:
         return ['', '', '', '']
-    own = (table.fluoroscope == name) & (table.exposure == exposure)
-    core = own & ~table.outlier
-    rmse = np.sqrt(np.mean(table.residual[core] ** 2, axis=0)) if core.any() else [np.nan] * 2
-    return [int(own.sum()), int(own.sum() - core.sum()), *rmse]
+    in_exposure = (table.fluoroscope == name) & (table.exposure == exposure)
+    is_inlier = in_exposure & ~table.outlier
+    rmse = (
+        np.sqrt(np.mean(table.residual[is_inlier] ** 2, axis=0))
+        if is_inlier.any()
+        else [np.nan] * 2
+    )
+    return [int(in_exposure.sum()), int(in_exposure.sum() - is_inlier.sum()), *rmse]
 
 
 def _targets(result: CalibrationResult) -> Iterator[Sequence[Any]]:
     targets = result.targets
     sd = np.sqrt(np.diagonal(targets.covariance, axis1=1, axis2=2))
     table = result.residuals
-    for target, xyz, own_sd in zip(targets.target_id, targets.xyz_mm, sd):
+    for target, xyz, target_sd in zip(targets.target_id, targets.xyz_mm, sd):
         counts: list[Any] = ['', '']
         if table is not None:
-            own = table.target_id == target
-            counts = [int(own.sum()), int((own & table.outlier).sum())]
-        yield [int(target), *xyz.tolist(), *own_sd.tolist(), *counts]
+            of_target = table.target_id == target
+            counts = [int(of_target.sum()), int((of_target & table.outlier).sum())]
+        yield [int(target), *xyz.tolist(), *target_sd.tolist(), *counts]
 
 
 def _interior(result: CalibrationResult) -> Iterator[Sequence[Any]]:

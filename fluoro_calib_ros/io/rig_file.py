@@ -89,8 +89,8 @@ def _names(path: Path, value: Any) -> list[str] | None:
 def _size(path: Path, value: Any) -> tuple[int, int] | None:
     if value is None:
         return None
-    whole = isinstance(value, list) and all(type(v) is int and v > 0 for v in value)
-    if not whole or len(value) != 2:
+    are_integers = isinstance(value, list) and all(type(v) is int and v > 0 for v in value)
+    if not are_integers or len(value) != 2:
         raise DataError(f'{path}, key image_size: width and height [px], such as [1024, 1024]')
     return value[0], value[1]
 
@@ -282,16 +282,16 @@ def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
     valid = isinstance(patterns, list) and all(isinstance(p, str) and p for p in patterns)
     if not valid or not patterns:
         raise DataError(f'{path}, key trials: paths or patterns, such as ["trials/*"]')
-    found: dict[str, Trial] = {}
+    trials: dict[str, Trial] = {}
     for pattern in patterns:
         for trial in _matching(path, pattern, out):
-            other = found.setdefault(trial.name, trial)
-            if other.path != trial.path:
+            first = trials.setdefault(trial.name, trial)
+            if first.path != trial.path:
                 raise DataError(
-                    f'{path}, key trials: {other.path} and {trial.path} would have the same '
+                    f'{path}, key trials: {first.path} and {trial.path} would have the same '
                     f'results; name one of them, or move it to a folder of its own'
                 )
-    return tuple(found.values())
+    return tuple(trials.values())
 
 
 def _matching(path: Path, pattern: str, out: Path) -> Sequence[Trial]:
@@ -304,13 +304,13 @@ def _matching(path: Path, pattern: str, out: Path) -> Sequence[Trial]:
     except (ValueError, OSError) as error:
         raise DataError(f'{path}, key trials: {pattern!r} is no pattern ({error})') from None
     trials = []
-    for one in paths:
-        relative = one.relative_to(folder)
+    for trial_path in paths:
+        relative = trial_path.relative_to(folder)
         parts = relative.parts
         if '..' in parts or any(part.startswith('.') for part in parts):
             continue
         if parts[: len(out.parts)] != out.parts:
-            name = relative if one.is_dir() else relative.with_suffix('')
+            name = relative if trial_path.is_dir() else relative.with_suffix('')
             trials.append(Trial(name.as_posix(), relative))
     if not trials:
         raise DataError(f'{path}, key trials: nothing in the study matches {pattern!r}')

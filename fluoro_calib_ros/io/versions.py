@@ -48,17 +48,17 @@ def calibrated_orientation(directory: Path, orientation: RigOrientation) -> RigO
 
     An orientation that was not healed is returned unchanged.
     """
-    known = orientation
+    ancestor = orientation
     ids: set[str] = set()
-    while known.source == 'healing':
-        if known.orientation_id in ids:  # edited files may form a cycle
+    while ancestor.source == 'healing':
+        if ancestor.orientation_id in ids:  # edited files may form a cycle
             return None
-        ids.add(known.orientation_id)
+        ids.add(ancestor.orientation_id)
         try:
-            known = load_orientation(orientation_path(parent_folder(directory, known)))
+            ancestor = load_orientation(orientation_path(parent_folder(directory, ancestor)))
         except DataError:
             return None
-    return known
+    return ancestor
 
 
 # Alarm of the drift watch: drift_alarm.json next to the calibrations concerned.
@@ -122,13 +122,13 @@ def read_learned_shapes(directory: PathLike) -> LearnedShapes:
             f'{path}: version {document.get("version")} of learned shapes is not known, only '
             f'{VERSION}'
         )
-    found = edited(directory, document, LEARNED_SHAPES)
-    if found is not None:
-        raise DataError(found)
+    finding = edited(directory, document, LEARNED_SHAPES)
+    if finding is not None:
+        raise DataError(finding)
     with ErrorsAt(path):
         try:
             learned = LearnedShapes(
-                bodies=tuple(_body(one) for one in document['bodies']),
+                bodies=tuple(_body(entry) for entry in document['bodies']),
                 orientation_ids=tuple(document['orientation_ids']),
                 calibration_ids=dict(document['calibration_ids']),
                 begin_ns=int(document['begin_ns']),

@@ -134,8 +134,8 @@ def phantom_figure(drawing: Drawing) -> Figure:
 def _draw_layer(axes: matplotlib.axes.Axes, drawing: Drawing, layer: int, radius: float) -> None:
     count = drawing.rows * drawing.columns
     blocked = set(drawing.blocked_id.tolist())
-    for place, (x, y, _) in enumerate(drawing.places_mm[layer * count : (layer + 1) * count]):
-        number = layer * count + place + 1
+    for index, (x, y, _) in enumerate(drawing.places_mm[layer * count : (layer + 1) * count]):
+        number = layer * count + index + 1
         is_blocked = number in blocked
         if is_blocked:
             axes.plot([x], [y], marker='x', color=RED, markersize=12, markeredgewidth=2)
@@ -223,10 +223,12 @@ def distortion_figure(
         (left, np.hypot(*field.duv.T), 'YlOrRd', 'magnitude [px]', scale.magnitude_px),
         (right, field.sd, 'cividis', 'standard deviation [px]', scale.sd_px),
     ):
-        shown = np.ma.masked_array(values, field.outside).reshape(len(centres[1]), len(centres[0]))
+        masked = np.ma.masked_array(values, field.outside).reshape(
+            len(centres[1]), len(centres[0])
+        )
         _draw_image_frame(axes, image_size)
         mesh = axes.pcolormesh(
-            *centres, shown, cmap=colours, vmin=0, vmax=largest, shading='nearest'
+            *centres, masked, cmap=colours, vmin=0, vmax=largest, shading='nearest'
         )
         figure.colorbar(mesh, ax=axes, label=label)
     factor = _draw_arrows(left, model, image_size, scale.magnitude_px)
@@ -288,10 +290,10 @@ def _draw_arrows(
     # At most two cells long, so that arrows hardly overlap, but small ones are visible.
     factor = _round_down(2 * max(image_size) / FIELD_ARROWS / largest)
     reference = _round_down(largest)
-    below = image_size[1] + 0.13 * max(image_size)
+    reference_v = image_size[1] + 0.13 * max(image_size)
     axes.quiver(
         np.append(u, 0),
-        np.append(v, below),
+        np.append(v, reference_v),
         np.append(duv[:, 0], reference),
         np.append(duv[:, 1], 0),
         angles='xy',
@@ -303,7 +305,9 @@ def _draw_arrows(
         linewidth=0.5,
         zorder=4,
     )
-    axes.text(reference * factor + 0.02 * max(image_size), below, f'{reference:g} px', va='center')
+    axes.text(
+        reference * factor + 0.02 * max(image_size), reference_v, f'{reference:g} px', va='center'
+    )
     return factor
 
 
@@ -321,7 +325,7 @@ ARROWS = 16  # number of arrows along the longer side of the image
 
 def comparison_document(comparison: Comparison, mm_per_px: float | None) -> dict[str, Any]:
     """Return a Comparison as a dict; mm_per_px is the scale at the phantom."""
-    largest, place = comparison.largest
+    largest, location = comparison.largest
     scale = float('nan') if mm_per_px is None else mm_per_px
     return {
         'interior_px': comparison.interior,
@@ -331,7 +335,7 @@ def comparison_document(comparison: Comparison, mm_per_px: float | None) -> dict
         'rms_mm': comparison.rms_px * scale,
         'largest_px': largest,
         'largest_mm': largest * scale,
-        'largest_at': list(place),
+        'largest_at': list(location),
         'share_significant': float(comparison.significant.mean()),
         'field_changed': comparison.field_changed,
     }
@@ -380,17 +384,17 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
             *comparison.uv.T, c=comparison.size, cmap='YlOrRd', s=40, marker='s', vmin=0
         )
         figure.colorbar(mesh, ax=axes, label='difference [px]')
-        marked = comparison.uv[comparison.significant]
-        axes.plot(*marked.T, '.', color=BLACK, markersize=2)
+        significant_uv = comparison.uv[comparison.significant]
+        axes.plot(*significant_uv.T, '.', color=BLACK, markersize=2)
         keys = np.floor(comparison.uv / step).astype(int)
-        _, first = np.unique(keys, axis=0, return_index=True)
+        _, first_of_cell = np.unique(keys, axis=0, return_index=True)
         # A difference far below its standard deviation must not be magnified to look large.
         longest = max(float(comparison.size.max()), float(np.median(comparison.sd)))
         factor = 0.8 * step / longest
         factor = float(f'{factor:.1g}')
         axes.quiver(
-            *comparison.uv[first].T,
-            *(factor * comparison.duv[first].T),
+            *comparison.uv[first_of_cell].T,
+            *(factor * comparison.duv[first_of_cell].T),
             angles='xy',
             scale_units='xy',
             scale=1,

@@ -86,10 +86,14 @@ def report_html(given: ReportInput, progress: Callable[[int, int], object] | Non
         )
         figures = {name: _figures(given, name, residuals[name], scale) for name in residuals}
         pictures: dict[str, list[tuple[str, str]]] = {name: [] for name in residuals}
-        drawn = [(name, *each) for name, own in figures.items() for each in own]
-        for done, (name, title, figure) in enumerate(drawn):
+        drawn = [
+            (name, *titled_figure)
+            for name, titled_figures in figures.items()
+            for titled_figure in titled_figures
+        ]
+        for number, (name, title, figure) in enumerate(drawn):
             if progress is not None:
-                progress(done, len(drawn))
+                progress(number, len(drawn))
             pictures[name].append((title, svg_text(figure)))
         beads = _bead_picture(given)
     return page(
@@ -192,9 +196,11 @@ def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[st
     """Return the largest outliers, with names and residuals [px], and their number."""
     length = {
         (name, exposure, target): px
-        for name, one in residuals.items()
+        for name, view_residuals in residuals.items()
         for exposure, target, px in zip(
-            one.exposure.tolist(), one.target_id.tolist(), np.hypot(*one.after.T).tolist()
+            view_residuals.exposure.tolist(),
+            view_residuals.target_id.tolist(),
+            np.hypot(*view_residuals.after.T).tolist(),
         )
     }
     points = sorted(_outlying_points(given), key=lambda o: -float(o['value']))
@@ -224,15 +230,17 @@ def _arrows(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str,
     """
     if sum(len(r.uv) for r in residuals.values()) > MAX_ARROWS:
         return {}
-    out: dict[str, Any] = {}
-    for name, one in residuals.items():
-        rows = np.column_stack([one.uv.round(1), one.after.round(2), one.inlier])
+    arrows: dict[str, Any] = {}
+    for name, view_residuals in residuals.items():
+        view_rows = np.column_stack(
+            [view_residuals.uv.round(1), view_residuals.after.round(2), view_residuals.inlier]
+        )
         exposures = {
-            int(number): rows[one.exposure == number].tolist()
-            for number in np.unique(one.exposure)
+            int(number): view_rows[view_residuals.exposure == number].tolist()
+            for number in np.unique(view_residuals.exposure)
         }
-        out[name] = {'size': list(given.calibrations[name].image_size), 'exposures': exposures}
-    return out
+        arrows[name] = {'size': list(given.calibrations[name].image_size), 'exposures': exposures}
+    return arrows
 
 
 def _radiographs(
@@ -244,18 +252,18 @@ def _radiographs(
     """
     by_rms = sorted(
         (-np.nan_to_num(after, nan=np.inf), name, number)
-        for name, one in residuals.items()
-        for number, _, _, after in one.of_exposures()
+        for name, view_residuals in residuals.items()
+        for number, _, _, after in view_residuals.of_exposures()
         if number in given.radiographs.get(name, {})
     )
-    out: dict[str, dict[int, str]] = {}
-    left = MAX_RADIOGRAPHS_BYTES
+    images: dict[str, dict[int, str]] = {}
+    bytes_left = MAX_RADIOGRAPHS_BYTES
     for _, name, number in by_rms:
         content = given.radiographs[name][number]
-        if len(content) <= left:
-            left -= len(content)
-            out.setdefault(name, {})[number] = base64.b64encode(content).decode()
-    return out
+        if len(content) <= bytes_left:
+            bytes_left -= len(content)
+            images.setdefault(name, {})[number] = base64.b64encode(content).decode()
+    return images
 
 
 def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[str, Any]:
@@ -282,8 +290,8 @@ def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[st
             for e in given.result['fluoroscopes'][name]['exposures']
         ],
         'exposures': [
-            (number, exposures.get(number, number), *rest)
-            for number, *rest in residuals.of_exposures()
+            (number, exposures.get(number, number), *statistics)
+            for number, *statistics in residuals.of_exposures()
         ],
         'mm_per_px': _mm_per_px(given, name),
         'distance_mm': phantom_distance(given.result['fluoroscopes'][name]['exposures']),
@@ -335,12 +343,12 @@ def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
     targets = given.result['targets']
     ids = np.array([t['target_id'] for t in targets], dtype=np.int64)
     row = given.phantom.index(ids) if len(ids) else np.zeros(0, dtype=int)
-    known = row >= 0
-    if known.sum() < 2:
+    on_phantom = row >= 0
+    if on_phantom.sum() < 2:
         return None
-    xyz = np.array([t['xyz_mm'] for t in targets], dtype=float)[known]
-    shift = xyz - given.phantom.xyz_mm[row[known]]
-    sd = given.phantom.sd_mm[row[known]]
+    xyz = np.array([t['xyz_mm'] for t in targets], dtype=float)[on_phantom]
+    shift = xyz - given.phantom.xyz_mm[row[on_phantom]]
+    sd = given.phantom.sd_mm[row[on_phantom]]
     order = np.argsort(-np.hypot(np.hypot(*shift.T[:2]), shift.T[2]) / sd)[:10]
     names = given.names.target_names()
     return {
@@ -348,7 +356,7 @@ def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
         'rms': np.sqrt(np.mean(shift**2, axis=0)).tolist(),
         'largest': [
             (names.get(int(i), int(i)), shift[k].tolist(), float(sd[k]))
-            for i, k in zip(ids[known][order], order)
+            for i, k in zip(ids[on_phantom][order], order)
         ],
     }
 
@@ -366,10 +374,10 @@ FROM_SOURCE = 'from source'
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, this package and its numerical libraries, by name."""
-    out = {'Python': platform.python_version()}
+    installed = {'Python': platform.python_version()}
     for package in PACKAGES:
         try:
-            out[package] = metadata.version(package)
+            installed[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            out[package] = FROM_SOURCE
-    return out
+            installed[package] = FROM_SOURCE
+    return installed

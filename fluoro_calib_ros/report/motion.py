@@ -47,8 +47,8 @@ def body_figure(poses: BodyPoses) -> Figure:
     values = np.full((len(poses.number), 6), np.nan)
     values[:, :3] = poses.position_mm
     if len(known):
-        turned = poses.rotation[known] @ poses.rotation[known[0]].T
-        values[known, 3:] = np.degrees(vector_from_matrix(turned))
+        rotation = poses.rotation[known] @ poses.rotation[known[0]].T
+        values[known, 3:] = np.degrees(vector_from_matrix(rotation))
     sd = poses.sd * np.repeat([1.0, 180 / np.pi], 3)
     return _series(poses.body, names, poses, (values, sd))
 
@@ -66,22 +66,22 @@ def _series(
     with matplotlib.rc_context(STYLE):
         figure = new_figure(10, 6, title)
         axes = figure.subplots(2, 3, sharex=True)
-        for number, (name, each) in enumerate(zip(names, axes.ravel().tolist())):
-            _draw(each, time_s, values[:, number], sd[:, number])
-            each.set_title(name)
+        for number, (name, panel) in enumerate(zip(names, axes.ravel().tolist())):
+            _draw(panel, time_s, values[:, number], sd[:, number])
+            panel.set_title(name)
             if filled.any():
-                each.fill_between(
+                panel.fill_between(
                     time_s,
                     0,
                     1,
                     where=filled,
-                    transform=each.get_xaxis_transform(),
+                    transform=panel.get_xaxis_transform(),
                     color=GREY,
                     alpha=FILLED,
                     linewidth=0,
                 )
-        for each in axes[1]:
-            each.set_xlabel('time [s]')
+        for panel in axes[1]:
+            panel.set_xlabel('time [s]')
         figure.supxlabel(
             f'band: {BAND:g} standard deviations of all errors'
             + ('; grey: predicted, no marker was seen' if filled.any() else ''),
@@ -105,16 +105,16 @@ def paths_figure(poses: Sequence[BodyPoses]) -> Figure:
         figure = new_figure(7, 6, 'Paths of the origins of the bodies')
         axes = figure.add_subplot(projection='3d')
         reach = 0.0
-        for one in poses:
-            known = np.flatnonzero(one.known)
+        for body_poses in poses:
+            known = np.flatnonzero(body_poses.known)
             if len(known):
-                axes.plot(*one.position_mm.T, linewidth=2.5, label=one.body)
-                reach = max(reach, float(np.ptp(one.position_mm[known], axis=0).max()))
-        for one in poses:
-            known = np.flatnonzero(one.known)
+                axes.plot(*body_poses.position_mm.T, linewidth=2.5, label=body_poses.body)
+                reach = max(reach, float(np.ptp(body_poses.position_mm[known], axis=0).max()))
+        for body_poses in poses:
+            known = np.flatnonzero(body_poses.known)
             for row in known[np.linspace(0, len(known) - 1, 10).astype(int)] if len(known) else ():
-                origin = one.position_mm[row]
-                for axis, colour in zip(one.rotation[row].T, (RED, GREY, BLUE)):
+                origin = body_poses.position_mm[row]
+                for axis, colour in zip(body_poses.rotation[row].T, (RED, GREY, BLUE)):
                     end = origin + (0.1 * reach + 5) * axis
                     axes.plot(*np.stack([origin, end]).T, color=colour, linewidth=0.8)
         axes.set(xlabel='x [mm]', ylabel='y [mm]', zlabel='z [mm]')
@@ -139,23 +139,23 @@ def points_figure(frames: Sequence[ReconstructedFrame], names: Mapping[int, str]
         sd[row, column[ok]] = frame.points.sd_mm[ok]
     found = np.isfinite(xyz[..., 0])
     time_s = (np.array([frame.stamp_ns for frame in frames]) - frames[0].stamp_ns) / 1e9
-    when = time_s if np.all(np.diff(time_s) > 0) else np.array([f.number for f in frames])
+    x = time_s if np.all(np.diff(time_s) > 0) else np.array([f.number for f in frames])
     labels = [names.get(int(i), str(i)) for i in ids]
     with matplotlib.rc_context(STYLE):
         figure = new_figure(14, 7, f'{len(ids)} targets in {len(frames)} frames')
         left, right = figure.subfigures(1, 2, width_ratios=(1, 1.2))
         _draw_paths(left.add_subplot(projection='3d'), xyz)
-        seen, known = right.subplots(1, 2, sharey=True, width_ratios=(3, 1))
-        _draw_gaps(seen, when, found, labels)
-        seen.set_xlabel('time [s]' if when is time_s else 'frame')
+        gap_axes, sd_axes = right.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+        _draw_gaps(gap_axes, x, found, labels)
+        gap_axes.set_xlabel('time [s]' if x is time_s else 'frame')
         rows = np.arange(len(ids))
         for axis, colour, shift in zip(range(3), (RED, GREY, BLUE), (-0.25, 0, 0.25)):
             median = [
                 np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else 0
                 for c in sd[..., axis].T
             ]
-            known.barh(rows + shift, median, 0.25, color=colour, label='xyz'[axis])
-        known.set(xlabel='median sd [mm]', title='sd')
+            sd_axes.barh(rows + shift, median, 0.25, color=colour, label='xyz'[axis])
+        sd_axes.set(xlabel='median sd [mm]', title='sd')
         right.legend(loc='outside lower right', ncols=3)
     return figure
 
@@ -164,8 +164,8 @@ def _draw_paths(axes: Axes, xyz: NDArray[np.float64]) -> None:
     """Draw the paths of points (T, n, 3), with a dot at the end of each."""
     for path in np.swapaxes(xyz, 0, 1):
         (line,) = axes.plot(*path.T, linewidth=1)
-        last = path[np.isfinite(path[:, 0])][-1:]
-        axes.scatter(*last.T, s=12, color=line.get_color())
+        last_point = path[np.isfinite(path[:, 0])][-1:]
+        axes.scatter(*last_point.T, s=12, color=line.get_color())
     axes.set(xlabel='x [mm]', ylabel='y [mm]', zlabel='z [mm]', title='paths in space')
     axes.zaxis.labelpad = 10
     if np.isfinite(xyz).any():
@@ -176,8 +176,8 @@ def _draw_gaps(
     axes: Axes, when: np.ndarray, found: NDArray[np.bool_], labels: Sequence[str]
 ) -> None:
     """Draw when targets (T, n) were found, one row a target, with the share of frames."""
-    for row, of_target in enumerate(found.T):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], of_target.astype(int), [0]])))
+    for row, is_found in enumerate(found.T):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], is_found.astype(int), [0]])))
         step = float(np.median(np.diff(when))) if len(when) > 1 else 1.0
         spans = [
             (when[start], when[stop - 1] + step - when[start])
@@ -202,9 +202,9 @@ def bodies_html(
 
     summary: as in BodiesOutcome.
     """
-    figures = [(f'joint {one.joint.name}', joint_figure(one)) for one in joints]
+    figures = [(f'joint {motion.joint.name}', joint_figure(motion)) for motion in joints]
     figures.append(('paths in space', paths_figure(poses)))
-    figures += [(f'body {one.body}', body_figure(one)) for one in poses]
+    figures += [(f'body {body_poses.body}', body_figure(body_poses)) for body_poses in poses]
     return page(
         'bodies.html',
         title=title,

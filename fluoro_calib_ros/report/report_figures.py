@@ -52,8 +52,8 @@ def relative_costs(
     F has the same unit in all rounds.
     """
     before = run.before
-    first = float(np.sum(before.noise.weight(before.q)[:, None] * before.residuals**2))
-    f = np.array([first] + [r.quadratic for r in run.history])
+    initial = float(np.sum(before.noise.weight(before.q)[:, None] * before.residuals**2))
+    f = np.array([initial] + [r.quadratic for r in run.history])
     recorded = np.array([r.G for r in run.history])
     g = recorded * f[:-1]
     return 100 * f / f[0], 100 * g / g[0], 100 * recorded / recorded[0]
@@ -137,14 +137,14 @@ def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -
     u, v = residuals.uv[residuals.inlier].T
     du, dv = after.T * factor
     axes.quiver(u, v, du, dv, angles='xy', scale_units='xy', scale=1, color=AFTER, width=0.0015)
-    outside = residuals.uv[~residuals.inlier]
-    axes.plot(*outside.T, 'x', color=BEFORE, markersize=4, label=f'{len(outside)} outliers')
+    outlier_uv = residuals.uv[~residuals.inlier]
+    axes.plot(*outlier_uv.T, 'x', color=BEFORE, markersize=4, label=f'{len(outlier_uv)} outliers')
     axes.set(xlabel='column u [px]', ylabel='row v [px]')
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
     axes.grid(False)
     axes.set_title(f'arrows magnified {factor:g} times; grey: no bead was seen here')
-    if len(outside):
+    if len(outlier_uv):
         axes.legend(loc='upper right')
     return figure
 
@@ -175,14 +175,14 @@ def exposure_bars(residuals: Residuals, name: str) -> Figure:
     numbers, counts, _, after = zip(*residuals.of_exposures())
     figure = new_figure(7.5, 4.6, f'{name}: by exposure')
     upper, lower = figure.subplots(2, 1, sharex=True)
-    place = np.arange(len(numbers))
-    upper.bar(place, after, color=AFTER)
+    positions = np.arange(len(numbers))
+    upper.bar(positions, after, color=AFTER)
     upper.axhline(np.median(after), color=BLACK, linewidth=1)
     upper.set(ylabel='RMS [px]', title='line: median')
-    lower.bar(place, counts, color=GREY)
+    lower.bar(positions, counts, color=GREY)
     lower.set(ylabel='beads', xlabel='exposure')
     step = max(1, len(numbers) // 15)
-    lower.set_xticks(place[::step], [str(number) for number in numbers[::step]])
+    lower.set_xticks(positions[::step], [str(number) for number in numbers[::step]])
     return figure
 
 

@@ -39,13 +39,13 @@ class Residuals:
 
     def of_exposures(self) -> list[tuple[int, int, float, float]]:
         """Return number, inliers, and RMS before and after [px] for each exposure."""
-        out = []
+        statistics = []
         for number in np.unique(self.exposure):
             rows = (self.exposure == number) & self.inlier
-            out.append(
+            statistics.append(
                 (int(number), int(rows.sum()), _rms(self.before[rows]), _rms(self.after[rows]))
             )
-        return out
+        return statistics
 
     def by_position(self, name: str, image_size: tuple[int, int]) -> Figure:
         """Return the figure of the residuals over the columns and rows of the image."""
@@ -78,14 +78,14 @@ def residuals_of(
     for frame in frames:
         if frame.number not in poses:
             continue
-        known = [i for i, target in enumerate(frame.target_id.tolist()) if target in points_mm]
-        ids = frame.target_id[known]
+        rows = [i for i, target in enumerate(frame.target_id.tolist()) if target in points_mm]
+        ids = frame.target_id[rows]
         rotation, position = poses[frame.number]
         points = np.array([points_mm[i] for i in ids.tolist()]).reshape(-1, 3)
         count = len(ids)
         exposure.append(np.full(count, frame.number))
         target_id.append(ids)
-        uv.append(frame.uv[known])
+        uv.append(frame.uv[rows])
         angle.append(np.full(count, np.nan if frame.angle is None else frame.angle))
         computed.append(
             project(
@@ -96,9 +96,11 @@ def residuals_of(
             )
         )
     if not exposure:
-        empty = np.zeros((0, 2))
-        none = np.zeros(0, dtype=int)
-        return Residuals(none, none, uv=empty, before=empty, after=empty, inlier=none.astype(bool))
+        no_uv = np.zeros((0, 2))
+        no_ids = np.zeros(0, dtype=int)
+        return Residuals(
+            no_ids, no_ids, uv=no_uv, before=no_uv, after=no_uv, inlier=no_ids.astype(bool)
+        )
     numbers, ids, observed, expected = map(np.concatenate, (exposure, target_id, uv, computed))
     angles = np.concatenate(angle)
     corrected = calibration.correct(observed, exact=True, angle=angles).uv
@@ -228,7 +230,7 @@ def position_figure(
     for axis, coordinate in enumerate(COORDINATES):
         limit_after = _residual_limit(after, axis)
         limit = max(_residual_limit(before, axis), limit_after)
-        for axes, (residuals, inliers), own_limit, colour, when in zip(
+        for axes, (residuals, inliers), panel_limit, colour, stage in zip(
             grid[axis],
             (before, after, after),
             (limit, limit, limit_after),
@@ -241,15 +243,15 @@ def position_figure(
                 uv[:, axis],
                 residual=residual,
                 inliers=inliers,
-                limit=own_limit,
+                limit=panel_limit,
                 colour=colour,
             )
             _plot_running_median(axes, uv[inliers, axis], residual[inliers], image_size[axis])
-            axes.set(xlim=(-0.5, image_size[axis] - 0.5), ylim=(-own_limit, own_limit))
+            axes.set(xlim=(-0.5, image_size[axis] - 0.5), ylim=(-panel_limit, panel_limit))
             rmse = np.sqrt(np.mean(residual[inliers] ** 2))
             outliers = f'{np.sum(~inliers)} of {len(uv)} outliers'
             axes.set(
-                title=f'{coordinate} {when}:\nRMSE {rmse:.3f} px, {outliers}',
+                title=f'{coordinate} {stage}:\nRMSE {rmse:.3f} px, {outliers}',
                 xlabel=('column u [px]', 'row v [px]')[axis],
                 ylabel=f'{coordinate} residual [px]',
             )

@@ -50,24 +50,24 @@ def accuracy_in_space(
     sd = []
     measured = []
     surveyed = []
-    expected = []
+    variances = []
     for frame in frames:
         row = phantom.index(frame.target_id)
         ok = (frame.points.status == OK) & (row >= 0)
         sd.append(frame.points.sd_mm[ok])
         half = np.count_nonzero(ok) // 2
-        one, other = np.flatnonzero(ok)[: 2 * half].reshape(2, half)
-        along = frame.points.xyz_mm[other] - frame.points.xyz_mm[one]
-        length = np.linalg.norm(along, axis=1)
-        covariance = frame.points.covariance_noise[one] + frame.points.covariance_noise[other]
-        unit = along / length[:, None]
+        first, second = np.flatnonzero(ok)[: 2 * half].reshape(2, half)
+        vector = frame.points.xyz_mm[second] - frame.points.xyz_mm[first]
+        length = np.linalg.norm(vector, axis=1)
+        covariance = frame.points.covariance_noise[first] + frame.points.covariance_noise[second]
+        unit = vector / length[:, None]
         measured.append(length)
-        there = phantom.xyz_mm[row]
-        surveyed.append(np.linalg.norm(there[other] - there[one], axis=1))
-        expected.append(
+        survey_xyz = phantom.xyz_mm[row]
+        surveyed.append(np.linalg.norm(survey_xyz[second] - survey_xyz[first], axis=1))
+        variances.append(
             np.einsum('ni,nij,nj->n', unit, covariance, unit)
-            + phantom.sd_mm[row[one]] ** 2
-            + phantom.sd_mm[row[other]] ** 2
+            + phantom.sd_mm[row[first]] ** 2
+            + phantom.sd_mm[row[second]] ** 2
         )
     if not sum(map(len, measured)):
         return None
@@ -81,7 +81,7 @@ def accuracy_in_space(
         distances=len(lengths),
         distance_mm=float(lengths.mean()),
         distance_rms_mm=float(np.sqrt(np.mean(difference**2))),
-        distance_sd_mm=float(np.sqrt(np.mean(np.concatenate(expected)))),
+        distance_sd_mm=float(np.sqrt(np.mean(np.concatenate(variances)))),
     )
 
 
@@ -90,13 +90,15 @@ def beams(orientation: RigOrientation) -> list[tuple[str, float, float]]:
 
     A beam is the ray through the principal point.
     """
-    out = []
+    pairs = []
     for i, j in combinations(range(len(orientation.fluoroscopes)), 2):
         cosine = float(orientation.rotation[i][2] @ orientation.rotation[j][2])
-        between = orientation.position_mm[i] - orientation.position_mm[j]
+        baseline = orientation.position_mm[i] - orientation.position_mm[j]
         names = f'{orientation.fluoroscopes[i]} and {orientation.fluoroscopes[j]}'
-        out.append((names, float(np.degrees(np.arccos(cosine))), float(np.linalg.norm(between))))
-    return out
+        pairs.append(
+            (names, float(np.degrees(np.arccos(cosine))), float(np.linalg.norm(baseline)))
+        )
+    return pairs
 
 
 def phantom_in_sensor(entry: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -133,11 +135,11 @@ def drawing(
     names = [n for n in (orientation.fluoroscopes if orientation else ()) if n in entries]
     for name in names or list(entries)[:1]:
         calibration = calibrations[name]
-        turn = np.eye(3)
+        rotation = np.eye(3)
         origin = np.zeros(3)
         if orientation is not None:
             index = orientation.fluoroscopes.index(name)
-            turn = orientation.rotation[index]
+            rotation = orientation.rotation[index]
             origin = orientation.position_mm[index]
         exposures = entries[name]['exposures']
         depth = BEHIND * (phantom_distance(exposures) if exposures else 1000.0)
@@ -149,9 +151,11 @@ def drawing(
             {
                 'name': name,
                 'source': origin.tolist(),
-                'corners': (rays @ turn + origin).tolist(),
+                'corners': (rays @ rotation + origin).tolist(),
             }
         )
         if not places:
-            places = [(turn.T @ phantom_in_sensor(entry) + origin).tolist() for entry in exposures]
+            places = [
+                (rotation.T @ phantom_in_sensor(entry) + origin).tolist() for entry in exposures
+            ]
     return {'fluoroscopes': fluoroscopes, 'places': places}

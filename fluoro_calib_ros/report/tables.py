@@ -149,13 +149,15 @@ def markdown_table(header: Sequence[Any], rows: Sequence[Sequence[Any]]) -> str:
             raise ValueError(f'a row has {len(row)} cells, the header has {len(titles)}')
     columns = list(zip(titles, *cells))
     widths = [max(3, *map(len, column)) for column in columns]
-    right = [len(column) > 1 and all(map(_is_number, column[1:])) for column in columns]
-    rule = ['-' * (width - 1) + ':' if r else '-' * width for width, r in zip(widths, right)]
+    right_aligned = [len(column) > 1 and all(map(_is_number, column[1:])) for column in columns]
+    rule = [
+        '-' * (width - 1) + ':' if r else '-' * width for width, r in zip(widths, right_aligned)
+    ]
     lines = []
     for row in [titles, rule, *cells]:
         aligned = [
             cell.rjust(width) if r else cell.ljust(width)
-            for cell, width, r in zip(row, widths, right)
+            for cell, width, r in zip(row, widths, right_aligned)
         ]
         lines.append('| ' + ' | '.join(aligned) + ' |')
     return '\n'.join(lines) + '\n'
@@ -261,8 +263,8 @@ def verdict_line(validation: Validation) -> str:
         ]
         return f'{text}; corrections to (sd) {", ".join(achieved)}'
     findings = validation.findings
-    more = f' ({len(findings) - 1} more in the report)' if len(findings) > 1 else ''
-    return f'{text}; {findings[0]}{more}' if findings else text
+    addition = f' ({len(findings) - 1} more in the report)' if len(findings) > 1 else ''
+    return f'{text}; {findings[0]}{addition}' if findings else text
 
 
 def _shortened(name: str) -> str:

@@ -138,9 +138,9 @@ def walking(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
     waves = np.cos(np.outer(phase, order)) @ GAIT_COS_DEG
     flexion = np.deg2rad(waves + np.sin(np.outer(phase, order[1:])) @ GAIT_SIN_DEG)
     swing = np.deg2rad(20) * np.cos(phase)
-    zero = np.zeros_like(phase)
-    rotation = matrix_from_vector(np.column_stack([swing, zero, zero])) @ matrix_from_vector(
-        np.deg2rad(3) * np.column_stack([zero, np.sin(phase), np.sin(phase + 1)])
+    zeros = np.zeros_like(phase)
+    rotation = matrix_from_vector(np.column_stack([swing, zeros, zeros])) @ matrix_from_vector(
+        np.deg2rad(3) * np.column_stack([zeros, np.sin(phase), np.sin(phase + 1)])
     )
     centre = np.column_stack(
         [
@@ -161,24 +161,24 @@ def landing(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
     """
     speed = np.sqrt(2 * GRAVITY * DROP_MM)
     t = np.maximum(times_s - FALL_S, 0.0)
-    before = np.minimum(times_s - FALL_S, 0.0)
+    before_contact = np.minimum(times_s - FALL_S, 0.0)
     s = t / RISE_S
-    height = -speed * before - GRAVITY / 2 * before**2
+    height = -speed * before_contact - GRAVITY / 2 * before_contact**2
     height -= speed * RISE_S * (2 - (2 + s) * np.exp(-s))
-    bent = 1 - (1 + t / FLEX_S) * np.exp(-t / FLEX_S)
-    tilt = np.deg2rad(4 + 18 * bent)
-    zero = np.zeros_like(t)
-    rotation = matrix_from_vector(np.column_stack([-tilt, 0.05 * bent, 0.04 * bent]))
+    bend = 1 - (1 + t / FLEX_S) * np.exp(-t / FLEX_S)
+    tilt = np.deg2rad(4 + 18 * bend)
+    zeros = np.zeros_like(t)
+    rotation = matrix_from_vector(np.column_stack([-tilt, 0.05 * bend, 0.04 * bend]))
     start = np.deg2rad(4)
     centre = np.column_stack(
         [
-            6 * bent,
+            6 * bend,
             SHANK_MM * (np.sin(tilt) - np.sin(start)) - 60,
             SHANK_MM * (np.cos(tilt) - np.cos(start)) + height + 20,
         ]
     )
-    flexion = np.deg2rad(15 + 50 * bent)
-    angles, translations = _coupled(flexion, zero)
+    flexion = np.deg2rad(15 + 50 * bend)
+    angles, translations = _coupled(flexion, zeros)
     return _motion(knee, times_s, (rotation, centre), angles, translations, of_tibia=True)
 
 
@@ -215,20 +215,21 @@ def _motion(
         matrix_from_vector(sign * angles[:, n : n + 1] * unit[n])
         for n, sign in enumerate((-1, 1, 1))
     )
-    turn = by_flexion @ by_adduction @ by_turn
+    relative_rotation = by_flexion @ by_adduction @ by_turn
     # Shifts along the three axes; distraction is opposite to the last one.
     axes = np.stack(
-        [np.broadcast_to(unit[0], angles.shape), by_flexion[:, :, 1], turn[:, :, 2]], axis=1
+        [np.broadcast_to(unit[0], angles.shape), by_flexion[:, :, 1], relative_rotation[:, :, 2]],
+        axis=1,
     )
     shift = np.linalg.solve(axes, (translations * [1, 1, -1])[..., None])[..., 0]
     rotation, origin = driven
     if of_tibia:
         tibia = driven
-        of_femur = rotation @ np.swapaxes(turn, 1, 2)
-        femur = of_femur, origin - (of_femur @ shift[..., None])[..., 0]
+        femur_rotation = rotation @ np.swapaxes(relative_rotation, 1, 2)
+        femur = femur_rotation, origin - (femur_rotation @ shift[..., None])[..., 0]
     else:
         femur = driven
-        tibia = rotation @ turn, origin + (rotation @ shift[..., None])[..., 0]
+        tibia = rotation @ relative_rotation, origin + (rotation @ shift[..., None])[..., 0]
     poses = {
         'femur': _of_body(*femur, knee.joint.proximal_frame),
         'tibia': _of_body(*tibia, knee.joint.distal_frame),
@@ -246,8 +247,8 @@ def _of_body(
     rotation: NDArray[np.float64], origin: NDArray[np.float64], frame: AnatomicalFrame
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the pose of a body from the pose of its anatomical frame."""
-    of_body = rotation @ frame.rotation.T
-    return of_body, origin - of_body @ frame.origin_mm
+    body_rotation = rotation @ frame.rotation.T
+    return body_rotation, origin - body_rotation @ frame.origin_mm
 
 
 def simulate_knee(

@@ -130,24 +130,24 @@ class MovingMarkers:
 
     def points_mm(self, frame: float) -> NDArray[np.float64]:
         """Return markers (n, 3) in the rig frame at an image number."""
-        out = np.empty_like(self.local_mm)
+        points = np.empty_like(self.local_mm)
         for number, (rotation, shift) in enumerate(self.poses(frame)):
             rows = self.cluster == number
-            out[rows] = self.local_mm[rows] @ rotation.T + shift
-        return out
+            points[rows] = self.local_mm[rows] @ rotation.T + shift
+        return points
 
 
 def _spread(rng: np.random.Generator, scene: MarkerScene) -> NDArray[np.float64]:
     """Return markers (n, 3) of all clusters [mm], none of them close to another of its cluster."""
-    out = []
+    positions = []
     for _ in range(scene.clusters):
-        chosen: list[NDArray[np.float64]] = []
-        while len(chosen) < scene.markers:
+        cluster: list[NDArray[np.float64]] = []
+        while len(cluster) < scene.markers:
             point = rng.uniform(-1, 1, 3) * scene.spread_mm * np.array([0.5, 0.5, 1.0])
-            if all(np.linalg.norm(point - other) > 0.25 * scene.spread_mm for other in chosen):
-                chosen.append(point)
-        out += chosen
-    return np.array(out)
+            if all(np.linalg.norm(point - other) > 0.25 * scene.spread_mm for other in cluster):
+                cluster.append(point)
+        positions += cluster
+    return np.array(positions)
 
 
 class MarkerRadiography(Radiography):
@@ -185,8 +185,8 @@ class MarkerRadiography(Radiography):
         rng = np.random.default_rng([self.seed, 23, frame])
         light, uv, hidden = self._light(frame, np.arange(len(self.markers.target_id)))
         image = self._grey(detected(light, self.settings), rng)
-        true = self._true(frame)
-        return MarkerImage(image, true, self.in_field(true, 6.0) & ~hidden, uv.mean(axis=0))
+        true_uv = self._true(frame)
+        return MarkerImage(image, true_uv, self.in_field(true_uv, 6.0) & ~hidden, uv.mean(axis=0))
 
     def expected_light(
         self,
@@ -212,8 +212,8 @@ class MarkerRadiography(Radiography):
         moments = frame + scene.shutter * ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5)
         points = np.array([self.markers.points_mm(moment) for moment in moments])
         points += np.asarray(shift_mm)
-        still = (np.eye(3), np.zeros(3))
-        uv = np.array([self.centres(of_moment, still) for of_moment in points])
+        unit_pose = (np.eye(3), np.zeros(3))
+        uv = np.array([self.centres(moment_points, unit_pose) for moment_points in points])
         light = self._open.copy()
         if scene.bones:
             light *= self._bones(self.markers.poses(frame))
@@ -250,20 +250,22 @@ class MarkerRadiography(Radiography):
             plane = cv2.remap(self._plane, *grid, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
             # Squares of metres minus squares of millimetres: single precision is not enough.
             detector = np.dstack([plane, np.full(grid[0].shape, self.settings.detector_mm)])
-            total = np.zeros_like(grid[0])
-            for number, of_moment in enumerate(sensor):
+            total_transmission = np.zeros_like(grid[0])
+            for number, centres in enumerate(sensor):
                 for spot in spots[1 + number % 2 :: 2][:SPOT_POINTS]:
-                    passed = np.ones_like(total)
-                    for one in rows:
+                    transmission = np.ones_like(total_transmission)
+                    for bead in rows:
                         # Only around the bead: regions of several beads are large.
-                        part = tuple(
+                        window = tuple(
                             slice((a - b) * FINE, (c - b) * FINE)
-                            for a, b, c in zip(low[one][::-1], (v0, u0), high[one][::-1])
+                            for a, b, c in zip(low[bead][::-1], (v0, u0), high[bead][::-1])
                         )
-                        path = chords(of_moment[one] - spot, detector[part] - spot, radius[one])
-                        passed[part] *= np.exp(-self.markers.scene.attenuation * path)
-                    total += passed
-            coarse = cv2.resize(total, (u1 - u0, v1 - v0), interpolation=cv2.INTER_AREA)
+                        path = chords(centres[bead] - spot, detector[window] - spot, radius[bead])
+                        transmission[window] *= np.exp(-self.markers.scene.attenuation * path)
+                    total_transmission += transmission
+            coarse = cv2.resize(
+                total_transmission, (u1 - u0, v1 - v0), interpolation=cv2.INTER_AREA
+            )
             light[v0:v1, u0:u1] *= coarse / (MOMENTS * SPOT_POINTS)
 
     def _bones(
@@ -281,14 +283,14 @@ class MarkerRadiography(Radiography):
                 direction = (to_bone / axes[:, None]).astype(np.float32) @ self._coarse
                 path += np.float32(sign) * _ellipsoid_path(source / axes, direction)
         shape = self._plane[::BONE_STEP, ::BONE_STEP].shape[:2]
-        passed = np.exp(-BONE_ATTENUATION * path).astype(np.float32).reshape(shape)
+        transmission = np.exp(-BONE_ATTENUATION * path).astype(np.float32).reshape(shape)
         height, width = self._plane.shape[:2]
         # The coarse pixels are samples at multiples of the step, not area means.
-        place = np.meshgrid(
+        coordinates = np.meshgrid(
             np.arange(width, dtype=np.float32) / BONE_STEP,
             np.arange(height, dtype=np.float32) / BONE_STEP,
         )
-        return cv2.remap(passed, *place, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        return cv2.remap(transmission, *coordinates, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
 
     def _hide(
         self, light: NDArray[np.float32], frame: int, true: NDArray[np.float64]
@@ -299,11 +301,11 @@ class MarkerRadiography(Radiography):
             if not disc.first <= frame <= disc.last:
                 continue
             middle = 0.5 * (disc.first + disc.last)
-            part = (frame - middle) / max(disc.last - middle, 1.0)
-            centre = true[disc.marker] + part * disc.drift
+            fraction = (frame - middle) / max(disc.last - middle, 1.0)
+            centre = true[disc.marker] + fraction * disc.drift
             mask = np.zeros(light.shape, dtype=np.uint8)
-            place = np.round(centre * 8).astype(int)
-            cv2.circle(mask, tuple(map(int, place)), round(disc.radius_px * 8), 255, -1, 16, 3)
+            pixel = np.round(centre * 8).astype(int)
+            cv2.circle(mask, tuple(map(int, pixel)), round(disc.radius_px * 8), 255, -1, 16, 3)
             light *= 1 - (1 - HIDING) * (mask / np.float32(255))
             hidden |= np.linalg.norm(true - centre, axis=1) < disc.radius_px + 2.5
         return hidden
@@ -316,8 +318,8 @@ class MarkerRadiography(Radiography):
         if settings.noise_blur_px:
             noise = cv2.GaussianBlur(noise, (0, 0), settings.noise_blur_px)
         largest = 2**settings.bits - 1
-        counted = (expected + noise) / settings.photons
-        grey = largest * (DARK + (OPEN_BEAM - DARK) * counted)
+        signal = (expected + noise) / settings.photons
+        grey = largest * (DARK + (OPEN_BEAM - DARK) * signal)
         if settings.inverted:
             grey = largest - grey
         dtype = np.uint8 if settings.bits == 8 else np.uint16
@@ -336,14 +338,14 @@ def _regions(
     merged = True
     while merged:
         merged = False
-        for one in range(len(boxes)):
-            for other in range(one + 1, len(boxes)):
-                _, a0, a1 = boxes[one]
-                rows, b0, b1 = boxes[other]
+        for first in range(len(boxes)):
+            for second in range(first + 1, len(boxes)):
+                _, a0, a1 = boxes[first]
+                rows, b0, b1 = boxes[second]
                 if (a0 < b1).all() and (b0 < a1).all():
-                    both = boxes[one][0] + rows
-                    boxes[one] = (both, np.minimum(a0, b0), np.maximum(a1, b1))
-                    del boxes[other]
+                    merged_rows = boxes[first][0] + rows
+                    boxes[first] = (merged_rows, np.minimum(a0, b0), np.maximum(a1, b1))
+                    del boxes[second]
                     merged = True
                     break
             if merged:
@@ -367,7 +369,7 @@ def _discs(
     rng: np.random.Generator, fluoroscope: str, markers: MovingMarkers, frames: int
 ) -> list[_Disc]:
     """Draw when markers are hidden, excluding the first images."""
-    out = []
+    discs = []
     mean = 0.5 * sum(HIDDEN_FRAMES)
     count = rng.poisson(markers.scene.hidden * frames * len(markers.target_id) / mean)
     for _ in range(count):
@@ -377,7 +379,7 @@ def _discs(
         radius = rng.uniform(*HIDING_PX)
         drift = radius * np.array([np.cos(angle), np.sin(angle)])
         marker = int(rng.integers(len(markers.target_id)))
-        out.append(
+        discs.append(
             _Disc(
                 fluoroscope,
                 marker,
@@ -387,7 +389,7 @@ def _discs(
                 drift=drift,
             )
         )
-    return out
+    return discs
 
 
 @dataclass(frozen=True)
@@ -402,11 +404,11 @@ class MarkerSequence:
 
     def __iter__(self) -> Iterator[Mapping[str, MarkerImage]]:
         """Yield the images of each moment, by fluoroscope."""
-        taken = {
+        radiographies = {
             fluoroscope.name: MarkerRadiography(
                 fluoroscope, self.markers, self.settings, self.frames, self.seed
             )
             for fluoroscope in self.rig.fluoroscopes
         }
         for frame in range(1, self.frames + 1):
-            yield {name: radiography.take(frame) for name, radiography in taken.items()}
+            yield {name: radiography.take(frame) for name, radiography in radiographies.items()}

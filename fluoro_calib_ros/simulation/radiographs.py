@@ -160,27 +160,29 @@ class Radiography:
     ) -> np.ndarray:
         """Return transmission (h, w) of beads: sensor frame (n, 3) [mm], pixels (n, 2), radii."""
         width, height = self.fluoroscope.image_size
-        fine = OVERSAMPLING
+        factor = OVERSAMPLING
         reach = radius_mm * self.fluoroscope.interior[2] / sensor_mm[:, 2] * 1.15 + MARGIN_PX
         low = np.floor(uv - reach[:, None]).astype(int)
         count = 2 * int(np.ceil(reach.max(initial=1.0))) + 2
         # Exclude shadows that do not touch the image; cut the others at its edge.
         seen = np.flatnonzero(((low < (width, height)) & (low + count > 0)).all(axis=1))
         detector = self._patches_mm(low[seen], count)
-        total = np.zeros((height, width), dtype=np.float32)
+        total_transmission = np.zeros((height, width), dtype=np.float32)
         spots = focal_spot(self.settings.focal_spot_mm)
         for spot in spots:
             transmission = np.ones(
-                ((height + 2 * count) * fine, (width + 2 * count) * fine), dtype=np.float32
+                ((height + 2 * count) * factor, (width + 2 * count) * factor), dtype=np.float32
             )
             path = chords(sensor_mm[seen, None] - spot, detector - spot, radius_mm[seen, None])
-            passed = np.exp(-self.settings.bead_attenuation * path).astype(np.float32)
-            passed = passed.reshape(len(seen), count * fine, count * fine)
-            for (column, row), part in zip((low[seen] + count) * fine, passed):
-                transmission[row : row + count * fine, column : column + count * fine] *= part
-            inner = transmission[count * fine : -count * fine, count * fine : -count * fine]
-            total += cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA)
-        return total / len(spots)
+            patches = np.exp(-self.settings.bead_attenuation * path).astype(np.float32)
+            patches = patches.reshape(len(seen), count * factor, count * factor)
+            for (column, row), patch in zip((low[seen] + count) * factor, patches):
+                transmission[row : row + count * factor, column : column + count * factor] *= patch
+            inner = transmission[
+                count * factor : -count * factor, count * factor : -count * factor
+            ]
+            total_transmission += cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA)
+        return total_transmission / len(spots)
 
     def _patches_mm(self, low: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Return points (n, k, 3) of the detector [mm] where rays meet patches of `count` pixels.
@@ -188,16 +190,16 @@ class Radiography:
         low (n, 2) are the first pixels of the patches. The points are interpolated linearly
         between pixels: the distortion bends by less than 1e-4 px from one pixel to the next.
         """
-        fine = OVERSAMPLING
-        around = np.arange(-1, count + 1)
-        pixels = low[:, None, None] + np.stack(np.meshgrid(around, around), axis=-1)
+        factor = OVERSAMPLING
+        offsets = np.arange(-1, count + 1)
+        pixels = low[:, None, None] + np.stack(np.meshgrid(offsets, offsets), axis=-1)
         coarse = self._detector_mm(pixels.reshape(-1, 2).astype(float))
         coarse = coarse.reshape(len(low), count + 2, count + 2, 3)
-        place = (np.arange(count * fine) + 0.5) / fine - 0.5
-        weight = np.maximum(1 - np.abs(place[:, None] - around), 0)  # (fine, coarse)
+        positions = (np.arange(count * factor) + 0.5) / factor - 0.5
+        weight = np.maximum(1 - np.abs(positions[:, None] - offsets), 0)  # (fine, coarse)
         rows = np.tensordot(weight, coarse, axes=(1, 1))  # (fine, n, coarse, 3)
-        both = np.tensordot(weight, rows, axes=(1, 2))  # (fine across, fine down, n, 3)
-        return both.transpose(2, 1, 0, 3).reshape(len(low), (count * fine) ** 2, 3)
+        detector_points = np.tensordot(weight, rows, axes=(1, 2))  # (fine across, fine down, n, 3)
+        return detector_points.transpose(2, 1, 0, 3).reshape(len(low), (count * factor) ** 2, 3)
 
     def _plates(
         self, rotation: NDArray[np.float64], origin: NDArray[np.float64]
@@ -211,13 +213,13 @@ class Radiography:
         rays = self._directions.reshape(-1, 3) @ rotation.astype(np.float32)
         rays = rays.reshape(self._directions.shape)
         half = CUBE_MM / 2
-        thick = self.settings.plate_mm
+        thickness = self.settings.plate_mm
         path = np.zeros(rays.shape[:2], dtype=np.float32)
         for axis in (0, 1):
             for side in (-1, 1):
                 low = np.full(3, -half, dtype=np.float32)
                 high = np.full(3, half, dtype=np.float32)
-                low[axis], high[axis] = sorted((side * half, side * (half + thick)))
+                low[axis], high[axis] = sorted((side * half, side * (half + thickness)))
                 path += _path_in_box(source, rays, low, high)
         return np.exp(-self.settings.plate_attenuation * path).astype(np.float32)
 
@@ -228,8 +230,8 @@ def focal_spot(diameter_mm: float) -> NDArray[np.float64]:
         return np.zeros((1, 3))
     angle = np.arange(FOCAL_POINTS - 1) * 2 * np.pi / (FOCAL_POINTS - 1)
     ring = diameter_mm / 4 * np.sqrt(2 * FOCAL_POINTS / (FOCAL_POINTS - 1))
-    around = ring * np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
-    return np.concatenate([np.zeros((1, 3)), around])
+    circle = ring * np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+    return np.concatenate([np.zeros((1, 3)), circle])
 
 
 def chords(
@@ -238,8 +240,8 @@ def chords(
     """Return lengths of rays from the origin inside spheres; arguments broadcast, last axis 3."""
     x, y, z = np.moveaxis(ray, -1, 0)
     a, b, c = np.moveaxis(centre, -1, 0)
-    along = (a * x + b * y + c * z) ** 2 / (x * x + y * y + z * z)
-    return 2 * np.sqrt(np.maximum(radius**2 - (a * a + b * b + c * c) + along, 0))
+    projection_squared = (a * x + b * y + c * z) ** 2 / (x * x + y * y + z * z)
+    return 2 * np.sqrt(np.maximum(radius**2 - (a * a + b * b + c * c) + projection_squared, 0))
 
 
 def _path_in_box(
@@ -277,15 +279,15 @@ def illumination(
     x = (uv - (np.asarray(image_size) - 1) / 2) / (max(image_size) / 2)
     light = 1 - 0.16 * np.sum(x * x, axis=-1) + 0.06 * x[..., 0] - 0.05 * x[..., 1] ** 3
     depth = _depth_in_field(uv, image_size, settings)
-    inside = 1 / (1 + np.exp(-np.clip(depth / FIELD_EDGE_PX, -40, 40)))
-    return (light * (LEAKAGE + (1 - LEAKAGE) * inside)).astype(np.float32)
+    field = 1 / (1 + np.exp(-np.clip(depth / FIELD_EDGE_PX, -40, 40)))
+    return (light * (LEAKAGE + (1 - LEAKAGE) * field)).astype(np.float32)
 
 
 def clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> NDArray[np.float32]:
     """Return transmission (h, w) of cables, bone-like shadows, screws and specks."""
     height, width = shape
     size = np.array([width, height])
-    out = np.ones(shape, dtype=np.float32)
+    transmission = np.ones(shape, dtype=np.float32)
     for number in range(count):
         depth = np.zeros(shape, dtype=np.float32)
         kind = number % 4
@@ -300,26 +302,26 @@ def clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> NDA
                 + t**3 * ends[3]
             )
             points = np.round(curve * 8).astype(np.int32)
-            thick = int(rng.integers(3, 9))
-            cv2.polylines(depth, [points], False, float(rng.uniform(0.2, 0.9)), thick, 16, 3)
+            thickness = int(rng.integers(3, 9))
+            cv2.polylines(depth, [points], False, float(rng.uniform(0.2, 0.9)), thickness, 16, 3)
         elif kind == 1:  # a bone
             axes = rng.uniform(0.05, 0.3, 2) * size
-            turn = float(rng.uniform(0, 180))
-            box = (tuple(map(float, centre)), tuple(map(float, axes)), turn)
+            angle_deg = float(rng.uniform(0, 180))
+            box = (tuple(map(float, centre)), tuple(map(float, axes)), angle_deg)
             cv2.ellipse(depth, box, float(rng.uniform(0.3, 0.8)), -1, 16)
             depth = cv2.GaussianBlur(depth, (0, 0), float(rng.uniform(1.5, 6)))
         elif kind == 2:  # screws
             for _ in range(3):
-                place = np.round((centre + rng.normal(0, 40, 2)) * 8).astype(int)
+                position = np.round((centre + rng.normal(0, 40, 2)) * 8).astype(int)
                 radius = round(8 * rng.uniform(4.5, 11))
-                cv2.circle(depth, tuple(map(int, place)), radius, 2.5, -1, 16, 3)
+                cv2.circle(depth, tuple(map(int, position)), radius, 2.5, -1, 16, 3)
         else:  # specks, smaller than a bead
             for _ in range(12):
-                place = np.round(rng.uniform(0, 1, 2) * size * 8).astype(int)
+                position = np.round(rng.uniform(0, 1, 2) * size * 8).astype(int)
                 radius = round(8 * rng.uniform(0.4, 1.3))
-                cv2.circle(depth, tuple(map(int, place)), radius, 0.8, -1, 16, 3)
-        out *= np.exp(-depth)
-    return out
+                cv2.circle(depth, tuple(map(int, position)), radius, 0.8, -1, 16, 3)
+        transmission *= np.exp(-depth)
+    return transmission
 
 
 def detected(light: NDArray[np.float32], settings: RadiographSettings) -> NDArray[np.float32]:
@@ -327,10 +329,10 @@ def detected(light: NDArray[np.float32], settings: RadiographSettings) -> NDArra
     sharp = cv2.GaussianBlur(light, (0, 0), settings.blur_px) if settings.blur_px else light
     if not settings.glare:
         return sharp
-    small = cv2.resize(light, None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA)
-    wide = cv2.GaussianBlur(small, (0, 0), GLARE_PX / 8, borderType=cv2.BORDER_REPLICATE)
-    wide = cv2.resize(wide, light.shape[::-1], interpolation=cv2.INTER_CUBIC)
-    return (1 - settings.glare) * sharp + settings.glare * wide
+    reduced = cv2.resize(light, None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA)
+    glare = cv2.GaussianBlur(reduced, (0, 0), GLARE_PX / 8, borderType=cv2.BORDER_REPLICATE)
+    glare = cv2.resize(glare, light.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return (1 - settings.glare) * sharp + settings.glare * glare
 
 
 def _digitised(
@@ -338,14 +340,14 @@ def _digitised(
 ) -> np.ndarray:
     """Return grey values (h, w) of light from 0 to 1, with quantum noise."""
     expected = np.maximum(light, 0) * settings.photons
-    counted = rng.poisson(expected).astype(np.float32)
+    counts = rng.poisson(expected).astype(np.float32)
     if settings.noise_blur_px:
         noise = cv2.GaussianBlur(
-            (counted - expected).astype(np.float32), (0, 0), settings.noise_blur_px
+            (counts - expected).astype(np.float32), (0, 0), settings.noise_blur_px
         )
-        counted = expected + noise
+        counts = expected + noise
     largest = 2**settings.bits - 1
-    grey = largest * (DARK + (OPEN_BEAM - DARK) * counted / settings.photons)
+    grey = largest * (DARK + (OPEN_BEAM - DARK) * counts / settings.photons)
     if settings.inverted:
         grey = largest - grey
     dtype = np.uint8 if settings.bits == 8 else np.uint16

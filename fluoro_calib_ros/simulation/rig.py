@@ -80,11 +80,11 @@ def bead_coordinates(rng: np.random.Generator) -> NDArray[np.float64]:
     face = np.column_stack([across.ravel(), up.ravel()])
     beads = []
     for side in range(4):
-        chosen = np.sort(rng.permutation(len(face))[: 126 if side < BEADS % 4 else 125])
-        flat = face[chosen] + rng.uniform(-3, 3, (len(chosen), 2))
-        turn = matrix_from_vector([0, 0, side * np.pi / 2])
-        depth = np.full(len(flat), CUBE_MM / 2)
-        beads.append(np.column_stack([flat[:, 0], depth, flat[:, 1]]) @ turn.T)
+        indices = np.sort(rng.permutation(len(face))[: 126 if side < BEADS % 4 else 125])
+        face_points = face[indices] + rng.uniform(-3, 3, (len(indices), 2))
+        rotation = matrix_from_vector([0, 0, side * np.pi / 2])
+        depth = np.full(len(face_points), CUBE_MM / 2)
+        beads.append(np.column_stack([face_points[:, 0], depth, face_points[:, 1]]) @ rotation.T)
     return np.round(np.concatenate(beads), 6)
 
 
@@ -165,16 +165,16 @@ class DistortionField:
         uv = np.asarray(uv, dtype=float)
         x = (uv - self.centre) / EDGE_PX
         r2 = np.sum(x * x, axis=1, keepdims=True)
-        turned = np.stack([-x[:, 1], x[:, 0]], axis=1)
+        perpendicular = np.stack([-x[:, 1], x[:, 0]], axis=1)
         # S shape of each line: a cubic that fixes the centre and the point at 0.63.
         s = x[:, ::-1] * (x[:, ::-1] ** 2 - 0.4) / 0.6
-        out = r2 * (self.pincushion * x + self.spiral * turned) + self.s_shape * s
+        displacement = r2 * (self.pincushion * x + self.spiral * perpendicular) + self.s_shape * s
         along_u, along_v = np.ascontiguousarray(uv.T)  # sums over an axis of two are slow
         for u, v, width, height_u, height_v in self.ripples:
             bump = np.exp(-((along_u - u) ** 2 + (along_v - v) ** 2) / (2 * width**2))
-            out[:, 0] += bump * height_u
-            out[:, 1] += bump * height_v
-        return out
+            displacement[:, 0] += bump * height_u
+            displacement[:, 1] += bump * height_v
+        return displacement
 
     def distort(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Return observed pixels (n, 2) of undistorted ones uv (n, 2), by fixed-point iteration.
@@ -273,12 +273,12 @@ class SimulatedExposures:
 
 def phantom_poses(rng: np.random.Generator, count: int) -> list[Pose]:
     """Return poses of the phantom on a turntable, tilted and shifted at random."""
-    turns = 2 * np.pi * (np.arange(count) + rng.uniform(0, 1, count)) / count
+    angles = 2 * np.pi * (np.arange(count) + rng.uniform(0, 1, count)) / count
     poses = []
-    for turn in turns:
+    for angle in angles:
         tilt = matrix_from_vector(np.append(rng.uniform(-0.35, 0.35, 2), 0))
         shift = rng.uniform([-80, -80, -70], [80, 80, 70])
-        poses.append((tilt @ matrix_from_vector([0, 0, turn]), shift))
+        poses.append((tilt @ matrix_from_vector([0, 0, angle]), shift))
     return poses
 
 
@@ -331,14 +331,14 @@ def detect_beads(
     observed = observed + rng.normal(0, detection.noise_px, ideal.shape)
     visible = np.flatnonzero(points_on_image(observed, fluoroscope.image_size))
     low, high = detection.beads
-    found = np.sort(rng.permutation(visible)[: rng.integers(low, high + 1)])
+    detected = np.sort(rng.permutation(visible)[: rng.integers(low, high + 1)])
     # Rounding also hides differences between CPUs in the last bit.
-    seen = np.round(observed[found], DECIMALS)
-    for row in np.flatnonzero(rng.random(len(found)) < detection.false_matches):
-        distance = np.sum((observed[visible] - observed[found[row]]) ** 2, axis=1)
-        wrong = visible[np.argsort(distance, kind='stable')[rng.integers(1, 9)]]
-        seen[row] = np.round(observed[wrong], DECIMALS)
-    return target_id[found], seen
+    detected_uv = np.round(observed[detected], DECIMALS)
+    for row in np.flatnonzero(rng.random(len(detected)) < detection.false_matches):
+        distance = np.sum((observed[visible] - observed[detected[row]]) ** 2, axis=1)
+        wrong_bead = visible[np.argsort(distance, kind='stable')[rng.integers(1, 9)]]
+        detected_uv[row] = np.round(observed[wrong_bead], DECIMALS)
+    return target_id[detected], detected_uv
 
 
 CLUSTER_MARKERS = 6  # number of markers in a rigid cluster
@@ -427,11 +427,11 @@ def image_frames(
         uv = fluoroscope.ideal(points_mm.reshape(-1, 3)).reshape(*points_mm.shape[:2], 2)
         observed = fluoroscope.distortion.distort(uv.reshape(-1, 2)).reshape(uv.shape)
         observed = np.round(observed + rng.normal(0, noise_px, uv.shape), DECIMALS)
-        seen = points_on_image(observed.reshape(-1, 2), fluoroscope.image_size)
-        seen = seen.reshape(observed.shape[:2])
+        on_image = points_on_image(observed.reshape(-1, 2), fluoroscope.image_size)
+        on_image = on_image.reshape(observed.shape[:2])
         ideal[fluoroscope.name] = uv
         frames[fluoroscope.name] = [
-            start.frame(fluoroscope, t, time_s, target_id[seen[t]], observed[t, seen[t]])
+            start.frame(fluoroscope, t, time_s, target_id[on_image[t]], observed[t, on_image[t]])
             for t, time_s in enumerate(times_s)
         ]
     return frames, ideal
@@ -444,12 +444,12 @@ def _markers_at(time_s: float, shapes: list[NDArray[np.float64]]) -> NDArray[np.
     sway = 70 * np.array(
         [np.sin(2 * np.pi * 0.31 * t), np.cos(2 * np.pi * 0.23 * t), 0.6 * np.sin(t)]
     )
-    out = []
+    points = []
     for number, (shape, centre) in enumerate(zip(shapes, CLUSTER_CENTRES)):
         about_x = bend if number < 2 else -bend
-        turn = matrix_from_vector([about_x, 0.3 * np.sin(1.1 * t + number), 0])
-        out.append((shape + centre) @ turn.T + sway)
-    return np.concatenate(out) if out else np.zeros((0, 3))
+        rotation = matrix_from_vector([about_x, 0.3 * np.sin(1.1 * t + number), 0])
+        points.append((shape + centre) @ rotation.T + sway)
+    return np.concatenate(points) if points else np.zeros((0, 3))
 
 
 def simulate_grid(
@@ -467,15 +467,15 @@ def simulate_grid(
     frames = {}
     for fluoroscope in rig.fluoroscopes:
         width, height = fluoroscope.image_size
-        across = np.linspace(0.08, 0.92, GRID[0]) * width
-        down = np.linspace(0.08, 0.92, GRID[1]) * height
-        ideal = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        u = np.linspace(0.08, 0.92, GRID[0]) * width
+        v = np.linspace(0.08, 0.92, GRID[1]) * height
+        ideal = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
         distorted = fluoroscope.distortion.distort(ideal)
         ids = np.arange(2001, 2001 + len(ideal))
-        of_fluoroscope = []
+        view_frames = []
         for index in range(count):
             observed = np.round(distorted + rng.normal(0, noise_px, distorted.shape), DECIMALS)
             time_s = index / 30.0
-            of_fluoroscope.append(start.frame(fluoroscope, index, time_s, ids, observed))
-        frames[fluoroscope.name] = of_fluoroscope
+            view_frames.append(start.frame(fluoroscope, index, time_s, ids, observed))
+        frames[fluoroscope.name] = view_frames
     return frames

@@ -175,15 +175,15 @@ def _check_chunks(file: BinaryIO) -> None:
         head = file.read(100)  # of a chunk: includes its sizes and compression
         opcode, length = RECORD.unpack_from(head)
         if opcode == Opcode.CHUNK:
-            (held,) = struct.unpack_from('<Q', head, RECORD.size + 16)
+            (chunk_size,) = struct.unpack_from('<Q', head, RECORD.size + 16)
             (name_length,) = struct.unpack_from('<I', head, RECORD.size + 28)
             start = RECORD.size + 32 + name_length + 8
             if head[RECORD.size + 32 : start - 8] == b'zstd':
                 with suppress(zstandard.ZstdError):
-                    held = max(held, zstandard.frame_content_size(head[start:]))
-            if held > MAX_CHUNK:
+                    chunk_size = max(chunk_size, zstandard.frame_content_size(head[start:]))
+            if chunk_size > MAX_CHUNK:
                 raise DataError(
-                    f'{file.name}: a chunk of the bag takes {held / 1e6:.0f} MB, more than '
+                    f'{file.name}: a chunk of the bag takes {chunk_size / 1e6:.0f} MB, more than '
                     f'{MAX_CHUNK / 1e6:.0f} MB are not read'
                 )
         elif opcode == Opcode.DATA_END:
@@ -199,8 +199,8 @@ def _complete_summary(file: BinaryIO) -> Summary | None:
         return None
     if not summary.channels and (summary.statistics is None or summary.statistics.channel_count):
         return None
-    used = {channel.schema_id for channel in summary.channels.values()} - {0}
-    return summary if used <= set(summary.schemas) else None
+    used_ids = {channel.schema_id for channel in summary.channels.values()} - {0}
+    return summary if used_ids <= set(summary.schemas) else None
 
 
 def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Iterator[BagMessage]:
@@ -223,7 +223,7 @@ def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Itera
 def _scan(file: BinaryIO) -> _Scan:
     """Read all records of a file to collect its channels and message counts."""
     scan = _Scan()
-    last = 0
+    last_ns = 0
     for record in _records(file):
         if isinstance(record, Schema):
             scan.schemas[record.id] = record
@@ -231,8 +231,8 @@ def _scan(file: BinaryIO) -> _Scan:
             scan.channels[record.id] = record
         elif isinstance(record, Message):
             scan.counts[record.channel_id] = scan.counts.get(record.channel_id, 0) + 1
-            scan.ordered = scan.ordered and record.log_time >= last
-            last = record.log_time
+            scan.ordered = scan.ordered and record.log_time >= last_ns
+            last_ns = record.log_time
     return scan
 
 
@@ -322,10 +322,12 @@ def bag_information(folder: PathLike) -> dict[str, Any]:
     """Return the information in metadata.yaml of a bag. Raises DataError."""
     path = os.path.join(folder, METADATA)
     document = read_yaml(path)
-    found = document.get('rosbag2_bagfile_information') if isinstance(document, dict) else None
-    if not isinstance(found, dict):
+    information = (
+        document.get('rosbag2_bagfile_information') if isinstance(document, dict) else None
+    )
+    if not isinstance(information, dict):
         raise DataError(f'{path}: {NO_METADATA}')
-    return found
+    return information
 
 
 def _listed_files(source: PathLike) -> list[str]:
@@ -345,10 +347,10 @@ def _listed_files(source: PathLike) -> list[str]:
     if not names or not all(isinstance(name, str) for name in names):
         raise DataError(f'{path}: the bag has no files')
     paths = [os.path.join(source, os.path.basename(name)) for name in names]
-    for each in paths:
-        if not os.path.exists(each):
+    for file_path in paths:
+        if not os.path.exists(file_path):
             raise DataError(
-                f'{path}: it lists {os.path.basename(each)}, but the folder has no such file'
+                f'{path}: it lists {os.path.basename(file_path)}, but the folder has no such file'
             )
     return paths
 
@@ -371,7 +373,7 @@ def is_foreign(source: PathLike) -> bool:
 
 def channels_of_bag(source: PathLike) -> list[ChannelInfo]:
     """Return all channels of a bag. Raises DataError for a bag that cannot be read."""
-    out = []
+    channels = []
     with _opened(source) as bag:
         for number, connection in enumerate(bag.connections, 1):
             text = connection.msgdef.data
@@ -385,16 +387,16 @@ def channels_of_bag(source: PathLike) -> list[ChannelInfo]:
             encoding = getattr(connection.ext, 'serialization_format', 'cdr')
             channel = Channel(number, connection.topic, encoding, metadata, number)
             schema = Schema(number, text.encode(), 'ros2msg', connection.msgtype)
-            out.append(ChannelInfo(channel, schema, connection.msgcount))
-    return out
+            channels.append(ChannelInfo(channel, schema, connection.msgcount))
+    return channels
 
 
 def messages_of_bag(source: PathLike, topics: Collection[str] | None) -> Iterator[BagMessage]:
     """Yield the messages of a bag in the order of log time. Raises DataError."""
     with _opened(source) as bag:
-        wanted = [c for c in bag.connections if topics is None or c.topic in topics]
-        if wanted:
-            for connection, time_ns, data in bag.messages(wanted):
+        connections = [c for c in bag.connections if topics is None or c.topic in topics]
+        if connections:
+            for connection, time_ns, data in bag.messages(connections):
                 yield BagMessage(connection.topic, connection.msgtype, time_ns, bytes(data))
 
 

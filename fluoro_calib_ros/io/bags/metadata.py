@@ -111,17 +111,17 @@ def from_cdr(data: bytes, msg_type: str) -> Any:
     try:
         return _read_cdr(typestore(), data, msg_type)
     except DataError as error:
-        last = error
+        last_error = error
     for changes in reversed(range(len(ADDED.get(msg_type, ())))):
         try:
-            earlier = _read_cdr(_earlier_typestore(changes), data, msg_type)
+            earlier_message = _read_cdr(_earlier_typestore(changes), data, msg_type)
         except DataError as error:
-            last = error
+            last_error = error
             continue
         added = {name: np.zeros(0) for name in _added(msg_type, changes)}
-        known = [f.name for f in dataclasses.fields(earlier) if f.init]
-        return kind(**{name: getattr(earlier, name) for name in known}, **added)
-    raise last
+        field_names = [f.name for f in dataclasses.fields(earlier_message) if f.init]
+        return kind(**{name: getattr(earlier_message, name) for name in field_names}, **added)
+    raise last_error
 
 
 def present_cdr(data: bytes, msg_type: str) -> bytes:
@@ -149,8 +149,8 @@ def _earlier_typestore(changes: int) -> Typestore:
     """Return the typestore with the types in ADDED after the first `changes` changes."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _package_texts().items():
-        earlier = name in ADDED and changes < len(ADDED[name])
-        text = earlier_text(name, changes) if earlier else text
+        is_earlier = name in ADDED and changes < len(ADDED[name])
+        text = earlier_text(name, changes) if is_earlier else text
         store.register(get_types_from_msg(text, name))
     return store
 

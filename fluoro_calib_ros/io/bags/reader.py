@@ -76,7 +76,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     _check_definitions(source, fluoroscopes)
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(fluoroscopes.values())}
     notes: list[str] = []
-    first: dict[tuple[str, int, int], int] = {}  # message in which a frame first occurred
+    first_message: dict[tuple[str, int, int], int] = {}  # where a frame first occurred
     restarts = dict.fromkeys(frames, 0)
     segments: dict[str, list[int]] = {name: [] for name in frames}
     for message in iterate_messages(source, fluoroscopes):
@@ -98,11 +98,11 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
             restarts[name] += 1
         segments[name].append(restarts[name])
         key = (name, restarts[name], frame.number)
-        if validate and key in first:
+        if validate and key in first_message:
             raise DataError(
-                f'{where}: frame {frame.number} is already given in message {first[key]}'
+                f'{where}: frame {frame.number} is already given in message {first_message[key]}'
             )
-        first[key] = number
+        first_message[key] = number
         frames[name].append(frame)
     if validate and any(restarts.values()):
         frames, step = _renumbered(frames, segments)
@@ -118,7 +118,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     if not topics:
         raise DataError(f'{source}: the bag has no message on {" or ".join(fluoroscopes)}')
     return BagContents(
-        {name: of_fluoroscope for name, of_fluoroscope in frames.items() if of_fluoroscope},
+        {name: view_frames for name, view_frames in frames.items() if view_frames},
         dict(sorted(topics.items())),
         tuple(notes),
     )
@@ -134,23 +134,23 @@ def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list
         for topic, info in topics_of(source).items()
         if info.type == RETRACTION
     }
-    wrong: dict[tuple[str, int], set[int]] = {}
+    retracted: dict[tuple[str, int], set[int]] = {}
     for message in iterate_messages(source, topics) if topics else ():
         with ErrorsAt(f'{source}, topic {message.topic}'):
-            one = from_cdr(message.data, RETRACTION)
-        stamp_ns = nanoseconds_from_stamp(one.header.stamp)
-        ids = wrong.setdefault((topics[message.topic], stamp_ns), set())
-        ids.update(one.target_id.tolist())
+            retraction = from_cdr(message.data, RETRACTION)
+        stamp_ns = nanoseconds_from_stamp(retraction.header.stamp)
+        retracted_ids = retracted.setdefault((topics[message.topic], stamp_ns), set())
+        retracted_ids.update(retraction.target_id.tolist())
     count = 0
-    out: dict[str, list[Frame]] = {}
-    for name, of_view in frames.items():
-        out[name] = []
-        for frame in of_view:
-            ids = wrong.get((name, frame.stamp_ns), set())
-            kept = ~np.isin(frame.target_id, list(ids))
+    remaining: dict[str, list[Frame]] = {}
+    for name, view_frames in frames.items():
+        remaining[name] = []
+        for frame in view_frames:
+            retracted_ids = retracted.get((name, frame.stamp_ns), set())
+            kept = ~np.isin(frame.target_id, list(retracted_ids))
             count += int(np.count_nonzero(~kept))
-            out[name].append(frame if kept.all() else frame.rows(kept))
-    return out, count
+            remaining[name].append(frame if kept.all() else frame.rows(kept))
+    return remaining, count
 
 
 def _is_restart(last: Frame, frame: Frame) -> bool:
@@ -162,14 +162,14 @@ def _renumbered(
     frames: Frames, segments: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, list[Frame]], int]:
     """Make frame numbers of different segments of a stream unique; return frames and step."""
-    largest = max(frame.number for each in frames.values() for frame in each)
+    largest = max(frame.number for view_frames in frames.values() for frame in view_frames)
     step = 10 ** len(str(largest))
     renumbered = {
         name: [
             replace(frame, number=frame.number + step * segment)
-            for frame, segment in zip(each, segments[name], strict=True)
+            for frame, segment in zip(view_frames, segments[name], strict=True)
         ]
-        for name, each in frames.items()
+        for name, view_frames in frames.items()
     }
     return renumbered, step
 
@@ -186,25 +186,25 @@ def iterate_messages(
     if is_foreign(source):
         yield from messages_of_bag(source, wanted)
         return
-    parts = [messages_of_file(path, wanted) for path in storage_files(source)]
-    yield from heapq.merge(*parts, key=lambda message: message.log_time_ns)
+    streams = [messages_of_file(path, wanted) for path in storage_files(source)]
+    yield from heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
 
 def topics_of(source: PathLike) -> dict[str, TopicInfo]:
     """Return the topics of a bag, sorted by name. Raises DataError."""
-    out: dict[str, TopicInfo] = {}
+    topics: dict[str, TopicInfo] = {}
     for path, channels in _channels(source):
         for info in channels:
             topic = info.channel.topic
             name = info.msg_type
-            known = out.get(topic, TopicInfo(name, 0, []))
-            if known.type != name:
+            previous = topics.get(topic, TopicInfo(name, 0, []))
+            if previous.type != name:
                 raise DataError(
-                    f'{path}: topic {topic} is of type {known.type} and of type {name}'
+                    f'{path}: topic {topic} is of type {previous.type} and of type {name}'
                 )
-            profiles = known.offered_qos or info.offered_qos
-            out[topic] = TopicInfo(name, known.count + info.count, profiles)
-    return dict(sorted(out.items()))
+            profiles = previous.offered_qos or info.offered_qos
+            topics[topic] = TopicInfo(name, previous.count + info.count, profiles)
+    return dict(sorted(topics.items()))
 
 
 def _channels(source: PathLike) -> Iterator[tuple[PathLike, list[ChannelInfo]]]:
@@ -218,22 +218,23 @@ def _channels(source: PathLike) -> Iterator[tuple[PathLike, list[ChannelInfo]]]:
 
 def _observation_topics(source: PathLike) -> dict[str, str]:
     """Return the fluoroscopes of a bag by topic. Raises DataError."""
-    out: dict[str, str] = {}
+    fluoroscopes: dict[str, str] = {}
     for topic, info in topics_of(source).items():
         if info.type != TARGET_OBSERVATIONS:
             continue
         with ErrorsAt(source):
             name = fluoroscope_of_topic(topic)
         check_safe_name(name, f'{source}, topic {topic}')
-        for other, fluoroscope in out.items():
+        for other_topic, fluoroscope in fluoroscopes.items():
             if fluoroscope == name:
                 raise DataError(
-                    f'{source}: the topics {other} and {topic} are both of fluoroscope {name}'
+                    f'{source}: the topics {other_topic} and {topic} are both of fluoroscope '
+                    f'{name}'
                 )
-        out[topic] = name
-    if not out:
+        fluoroscopes[topic] = name
+    if not fluoroscopes:
         raise DataError(f'{source}: the bag has no topic of type {TARGET_OBSERVATIONS}')
-    return out
+    return fluoroscopes
 
 
 def _check_definitions(source: PathLike, topics: Collection[str]) -> None:
@@ -261,9 +262,12 @@ def _is_same_definition(recorded: Definition) -> bool:
     """
     if not recorded.text.strip():
         return recorded.type_hash in ('', type_hash(TARGET_OBSERVATIONS))
-    known = typestore().fielddefs
-    found = fields_of(TARGET_OBSERVATIONS, recorded.text, recorded.encoding)
-    return all(name in known and known[name][1] == fields for name, fields in found.items())
+    definitions = typestore().fielddefs
+    recorded_fields = fields_of(TARGET_OBSERVATIONS, recorded.text, recorded.encoding)
+    return all(
+        name in definitions and definitions[name][1] == fields
+        for name, fields in recorded_fields.items()
+    )
 
 
 # Images of a bag: sensor_msgs/Image and CompressedImage, without ROS.
@@ -290,14 +294,14 @@ def image_topics(source: PathLike) -> dict[str, str]:
     The suffix /compressed of image_transport is ignored. If a fluoroscope has both, the
     uncompressed images are used. Raises DataError.
     """
-    out: dict[str, str] = {}
+    topics: dict[str, str] = {}
     for kind in (COMPRESSED_IMAGE, IMAGE):
         for topic, info in topics_of(source).items():
             if info.type == kind and info.count:
                 base = topic.removesuffix('/compressed')
                 parts = [part for part in base.split('/') if part]
-                out[parts[0] if len(parts) == 1 else fluoroscope_of_topic(base)] = topic
-    return out
+                topics[parts[0] if len(parts) == 1 else fluoroscope_of_topic(base)] = topic
+    return topics
 
 
 def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
@@ -357,12 +361,12 @@ def with_angles(
     """
     angles = angles_in(source, frames, options)
     if not angles.joints:
-        return {name: list(each) for name, each in frames.items()}, ()
-    out = {
-        name: [replace(frame, angle=angles.at(name, frame.stamp_ns)) for frame in each]
-        for name, each in frames.items()
+        return {name: list(view_frames) for name, view_frames in frames.items()}, ()
+    updated = {
+        name: [replace(frame, angle=angles.at(name, frame.stamp_ns)) for frame in view_frames]
+        for name, view_frames in frames.items()
     }
-    return out, tuple(_notes(source, out, angles))
+    return updated, tuple(_notes(source, updated, angles))
 
 
 def angles_in(source: PathLike, fluoroscopes: Iterable[str], options: AngleOptions) -> JointAngles:
@@ -386,38 +390,40 @@ def angles_in(source: PathLike, fluoroscopes: Iterable[str], options: AngleOptio
 def _read_states(source: PathLike, angles: JointAngles) -> None:
     """Add all joint states in a bag to their tracks. Raises DataError."""
     topics = joint_topics(source)
-    wanted = set(angles.joints.values())
+    joints = set(angles.joints.values())
     if not topics:
         raise DataError(
             f'{source}: the bag has no joint states ({JOINT_STATE}), so the angle of joint '
-            f'{", ".join(sorted(wanted))} is unknown'
+            f'{", ".join(sorted(joints))} is unknown'
         )
-    found: dict[str, set[str]] = {}  # topics by joint
+    topics_by_joint: dict[str, set[str]] = {}  # topics by joint
     for message in iterate_messages(source, topics):
         with ErrorsAt(f'{source}, topic {message.topic}'):
             state = from_cdr(message.data, JOINT_STATE)
         for joint in state.name:
-            found.setdefault(joint, set()).add(message.topic)
+            topics_by_joint.setdefault(joint, set()).add(message.topic)
         angles.add(nanoseconds_from_stamp(state.header.stamp), state.name, state.position)
-    for joint in sorted(wanted):
-        if joint not in found:
+    for joint in sorted(joints):
+        if joint not in topics_by_joint:
             raise DataError(
-                f'{source}: the bag has no joint {joint!r}, only {", ".join(sorted(found))}'
+                f'{source}: the bag has no joint {joint!r}, only '
+                f'{", ".join(sorted(topics_by_joint))}'
             )
-        if len(found[joint]) > 1:
+        if len(topics_by_joint[joint]) > 1:
             raise DataError(
-                f'{source}: joint {joint!r} is on the topics {", ".join(sorted(found[joint]))}; '
-                'its angle must come from one of them'
+                f'{source}: joint {joint!r} is on the topics '
+                f'{", ".join(sorted(topics_by_joint[joint]))}; its angle must come from one of '
+                'them'
             )
 
 
 def _notes(source: PathLike, frames: Frames, angles: JointAngles) -> Iterable[str]:
     """Yield a sentence for each fluoroscope that has frames with an unknown angle."""
-    for name, each in frames.items():
-        unknown = [frame for frame in each if frame.angle is None]
-        if name in angles.joints and unknown:
+    for name, view_frames in frames.items():
+        without_angle = [frame for frame in view_frames if frame.angle is None]
+        if name in angles.joints and without_angle:
             yield (
-                f'{source}: {len(unknown)} of {len(each)} frames of fluoroscope {name} have no '
-                f'angle, the first is frame {unknown[0].number} '
-                f'({angles.doubt(name, unknown[0].stamp_ns)})'
+                f'{source}: {len(without_angle)} of {len(view_frames)} frames of fluoroscope '
+                f'{name} have no angle, the first is frame {without_angle[0].number} '
+                f'({angles.doubt(name, without_angle[0].stamp_ns)})'
             )

@@ -148,8 +148,8 @@ class Recording:
         """Queue a message; return False if it had to be dropped."""
         with self._condition:
             share = 1.0 if len(data) <= SMALL_BYTES else LARGE_SHARE
-            full = self.waiting_bytes + len(data) > share * self.options.queue_size * 1e6
-            if self.fault or (full and self.waiting_bytes):
+            is_full = self.waiting_bytes + len(data) > share * self.options.queue_size * 1e6
+            if self.fault or (is_full and self.waiting_bytes):
                 self.dropped[topic] += 1
                 return False
             self._queue.append(_Message(topic, data, received_ns, sent_ns))
@@ -230,8 +230,8 @@ class Recording:
             self._writer.split()
             self._file_start = time.monotonic()
             for messages in self._latched.values():
-                for latched in messages:
-                    self._write_message(latched._replace(received_ns=item.received_ns))
+                for message in messages:
+                    self._write_message(message._replace(received_ns=item.received_ns))
         self._write_message(item)
         self.counts[item.topic] += 1
         self._unflushed[item.topic] += 1

@@ -121,8 +121,8 @@ class FileSalvage:
             if end is None or data[position] == Opcode.CHUNK or _looks_like_chunk(data, position):
                 chunk = _chunk_at(data, position)
                 if chunk is not None:
-                    for opcode, start, behind in _records_of(chunk.content):
-                        yield from self._record(opcode, bytes(chunk.content[start:behind]))
+                    for opcode, start, stop in _records_of(chunk.content):
+                        yield from self._record(opcode, bytes(chunk.content[start:stop]))
                     position = chunk.end
                     continue
                 self._note_lost_chunk(data, position, end)
@@ -207,8 +207,8 @@ class FileSalvage:
             return
         if zlib.crc32(data[start : footer + FOOTER.size - 4]) != checksum:
             return
-        for opcode, position, behind in _records_of(data, start, footer):
-            content = data[position:behind]
+        for opcode, position, stop in _records_of(data, start, footer):
+            content = data[position:stop]
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._define(opcode, content)
             elif opcode == Opcode.STATISTICS:
@@ -228,17 +228,17 @@ class FileSalvage:
             return
         lost: dict[str, int] = {}
         position = end
-        while (behind := self._end_of_record(data, position)) is not None:
+        while (index_end := self._end_of_record(data, position)) is not None:
             if data[position] != Opcode.MESSAGE_INDEX:
                 break
             try:
-                content = BytesIO(data[position + RECORD.size : behind])
+                content = BytesIO(data[position + RECORD.size : index_end])
                 index = MessageIndex.read(ReadDataStream(content))
             except Exception:  # damaged bytes make the reader raise almost anything
                 break
             topic = self._topic(index.channel_id) or '(unknown)'
             lost[topic] = lost.get(topic, 0) + len(index.records)
-            position = behind
+            position = index_end
         self._note('a chunk is damaged', lost)
 
     def _note(self, cause: str, lost: dict[str, int] | None = None) -> None:
@@ -246,8 +246,8 @@ class FileSalvage:
         if self._open_damage is None:
             self._open_damage = (cause, self._last_ns, {})
         for topic, count in (lost or {}).items():
-            known = self._open_damage[2]
-            known[topic] = known.get(topic, 0) + count
+            counts = self._open_damage[2]
+            counts[topic] = counts.get(topic, 0) + count
 
     def _close_damage(self, next_ns: int | None) -> None:
         """End the current damage at the time of the next message, None at the end of the file."""
@@ -305,8 +305,8 @@ def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | No
     """Return the content of a chunk, None if it cannot be decompressed."""
     try:
         if compression == b'zstd':
-            held = zstandard.frame_content_size(data)
-            limit = size if held < 0 else held  # a frame need not state its size
+            content_size = zstandard.frame_content_size(data)
+            limit = size if content_size < 0 else content_size  # a frame need not state its size
             if not 0 < limit <= MAX_CHUNK:
                 return None
             return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
@@ -321,9 +321,9 @@ def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | No
 
 def _is_whole(content: bytes) -> bool:
     """Return whether a chunk without checksum consists of complete records."""
-    known = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+    data_opcodes = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
     records = list(_records_of(content))
-    if not records or any(opcode not in known for opcode, *_ in records):
+    if not records or any(opcode not in data_opcodes for opcode, *_ in records):
         return False
     return records[-1][-1] == len(content)
 
@@ -467,11 +467,11 @@ class TopicReport:
     @property
     def has_gap(self) -> bool:
         """Whether a stream was interrupted; only messages with a header are a stream."""
-        usual = self.interval_ns
+        interval_ns = self.interval_ns
         return (
             len(self.stamp_ns) > 1
-            and 0 < usual < STREAM_NS
-            and self.longest_gap_s * 1e9 > max(GAP * usual, STREAM_NS)
+            and 0 < interval_ns < STREAM_NS
+            and self.longest_gap_s * 1e9 > max(GAP * interval_ns, STREAM_NS)
         )
 
     @property
@@ -512,16 +512,16 @@ class BagReport:
     @property
     def faults(self) -> list[str]:
         """Sentences about everything that is wrong."""
-        found = [f'{d.path}: {d.cause}' for d in self.damages]
-        found += [f'{topic}: {count} messages are lost' for topic, count in self.lost.items()]
+        faults = [f'{d.path}: {d.cause}' for d in self.damages]
+        faults += [f'{topic}: {count} messages are lost' for topic, count in self.lost.items()]
         for topic, report in self.topics.items():
-            found += [f'{topic}: {text}' for text in _faults(report)]
-        found += [
+            faults += [f'{topic}: {text}' for text in _faults(report)]
+        faults += [
             f'fluoroscope {name}: {count} {"frame" if count == 1 else "frames"} without partner'
             for name, count in self.without_partner.items()
             if count
         ]
-        return found
+        return faults
 
 
 def inspect_bag(source: PathLike) -> BagReport:
@@ -559,8 +559,8 @@ def _read_header(report: TopicReport, data: bytes) -> None:
         sec, nanosec, length = struct.unpack_from(f'{order}iII', data, 4)
         report.stamp_ns.append(sec * 10**9 + nanosec)
         if report.type in _NUMBERED:
-            behind = 12 + length
-            (number,) = struct.unpack_from(f'{order}I', data, 4 + behind + -behind % 4)
+            offset = 12 + length
+            (number,) = struct.unpack_from(f'{order}I', data, 4 + offset + -offset % 4)
             report.numbers.append(number)
     except struct.error:
         report.undecodable += 1
@@ -575,30 +575,30 @@ def _without_partner(topics: Mapping[str, TopicReport]) -> dict[str, int]:
     if len(numbers) < 2:
         return {}
     common = Counter(next(iter(numbers.values())))
-    for each in numbers.values():
-        common &= each
-    return {name: (each - common).total() for name, each in sorted(numbers.items())}
+    for counter in numbers.values():
+        common &= counter
+    return {name: (counter - common).total() for name, counter in sorted(numbers.items())}
 
 
 def _faults(report: TopicReport) -> list[str]:
-    found = []
+    faults = []
     if report.has_gap:
-        found.append(
+        faults.append(
             f'a gap of {report.longest_gap_s:.3f} s, the usual interval is '
             f'{report.interval_ns * 1e-6:.1f} ms'
         )
     if report.backward_jumps:
-        found.append(f'the clock runs backwards {_times(report.backward_jumps)}')
+        faults.append(f'the clock runs backwards {_times(report.backward_jumps)}')
     if report.missing_frames:
         noun = 'frame is' if report.missing_frames == 1 else 'frames are'
-        found.append(f'{report.missing_frames} {noun} missing in the frame numbers')
+        faults.append(f'{report.missing_frames} {noun} missing in the frame numbers')
     if report.repeated_frames:
-        found.append(f'{report.repeated_frames} frame numbers are repeated')
+        faults.append(f'{report.repeated_frames} frame numbers are repeated')
     if report.restarts:
-        found.append(f'the frame numbers begin again {_times(report.restarts)}')
+        faults.append(f'the frame numbers begin again {_times(report.restarts)}')
     if report.undecodable:
-        found.append(f'{report.undecodable} messages are too short for their type')
-    return found
+        faults.append(f'{report.undecodable} messages are too short for their type')
+    return faults
 
 
 def _times(count: int) -> str:

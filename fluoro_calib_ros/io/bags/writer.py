@@ -143,9 +143,9 @@ class BagWriter:
         """
         is_cdr = isinstance(message, (bytes, bytearray, memoryview))
         data = bytes(message) if is_cdr else to_cdr(message, msg_type)
-        received = int(log_time_ns)
-        sent = received if publish_time_ns is None else int(publish_time_ns)
-        for time_ns in (received, sent):
+        received_ns = int(log_time_ns)
+        sent_ns = received_ns if publish_time_ns is None else int(publish_time_ns)
+        for time_ns in (received_ns, sent_ns):
             if not 0 <= time_ns < NO_MESSAGE_NS:
                 raise DataError(
                     f'{self.path}, topic {topic}: {time_ns} ns is not a time that a bag can hold'
@@ -157,10 +157,10 @@ class BagWriter:
                     f'{self.path}, topic {topic}: a message of type {msg_type} does not belong to '
                     f'this topic of type {entry.msg_type}'
                 )
-            self._mcap.add_message(entry.channel, received, data, sent)
+            self._mcap.add_message(entry.channel, received_ns, data, sent_ns)
         entry.count += 1
-        self._files[-1].add(received)
-        self._total.add(received)
+        self._files[-1].add(received_ns)
+        self._total.add(received_ns)
 
     def write_frame(
         self,
@@ -300,16 +300,16 @@ def check_replaceable(path: str, overwrite: bool) -> None:
 def _put_in_place(folder: str, path: str, overwrite: bool) -> None:
     """Rename a finished folder; with overwrite, delete the replaced bag afterwards."""
     sync_folder(folder)
-    old = f'{folder}.old'
+    backup = f'{folder}.old'
     replaced = overwrite and os.path.isdir(path)
     if replaced:
-        os.rename(path, old)
+        os.rename(path, backup)
     try:
         os.rename(folder, path)
     except OSError:
         if replaced:
-            os.rename(old, path)
+            os.rename(backup, path)
         raise
     sync_folder(os.path.dirname(path))
     if replaced:
-        shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(backup, ignore_errors=True)

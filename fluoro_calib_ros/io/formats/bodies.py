@@ -71,15 +71,15 @@ _FIRST = re.compile(r'(?P<body>.+)_R11(?P<filter>_[\d.]+Hz)?')
 
 def _read_xmalab(path: Path, settings: FileSettings) -> Content:
     """Read the poses of rigid bodies. Raises DataError."""
-    header, body, first = read_frames(path)
-    names = _bodies(header, first)
-    require_width(body, len(header.cells), 'the header')
+    header, rows, first_column = read_frames(path)
+    names = _bodies(header, first_column)
+    require_width(rows, len(header.cells), 'the header')
     mm = settings.unit_read(path)
-    frame = frame_numbers(body, first)
-    values = np.array([row.numbers_or_nan(first) for row in body])
-    matrices = values.reshape(len(body), len(names), 4, 4).transpose(0, 1, 3, 2)
-    for row, of_row in zip(body, matrices):
-        _check(row, of_row, names)
+    frame = frame_numbers(rows, first_column)
+    values = np.array([row.numbers_or_nan(first_column) for row in rows])
+    matrices = values.reshape(len(rows), len(names), 4, 4).transpose(0, 1, 3, 2)
+    for row, row_matrices in zip(rows, matrices):
+        _check(row, row_matrices, names)
     missing = np.isnan(matrices).any(axis=(2, 3))
     rotation = matrices[..., :3, :3].copy()
     translation = from_units(matrices[..., :3, 3], mm)
@@ -99,8 +99,8 @@ def _bodies(row: Row, first: int) -> list[str]:
         if match is None:
             row.fail(f'the column {cells[start]!r} is not <body>_R11')
         expected = [f'{match["body"]}_{column}{match["filter"] or ""}' for column in COLUMNS]
-        given = cells[start : start + len(COLUMNS)]
-        for cell, name in zip(given, expected):
+        found_cells = cells[start : start + len(COLUMNS)]
+        for cell, name in zip(found_cells, expected):
             if cell != name:
                 row.fail(f'the column {cell!r} should be {name!r}')
         names.append(match['body'] + (match['filter'] or ''))
@@ -156,7 +156,7 @@ def _write_autoscoper(path: Path, content: Content, settings: FileSettings) -> W
     frames = frames_of(path, [content.bodies], settings, needs_rate=False)
     matrices = homogeneous(bodies_of(content.bodies, frames), mm)
     with atomic_file(path, 'w') as file:
-        file.writelines(joined(of_frame.ravel()) + '\n' for of_frame in matrices)
+        file.writelines(joined(frame_matrices.ravel()) + '\n' for frame_matrices in matrices)
     order = f'{path}: row 1 is frame {frames.first}, bodies are {", ".join(content.bodies.names)}'
     return Written((str(path),), (*notes, order))
 
@@ -188,8 +188,8 @@ def _read_poses(path: Path, settings: FileSettings) -> Content:
         rows.require(name, ~np.isinf(column), 'not a finite number')
     names = list(dict.fromkeys(body.tolist()))
     frames, row = np.unique(frame, return_inverse=True)
-    place = np.array([names.index(name) for name in body.tolist()])
-    repeated = first_repeated(row * len(names) + place)
+    body_index = np.array([names.index(name) for name in body.tolist()])
+    repeated = first_repeated(row * len(names) + body_index)
     if repeated is not None:
         first, second = repeated
         rows.fail(
@@ -198,15 +198,15 @@ def _read_poses(path: Path, settings: FileSettings) -> Content:
             f'{rows.lines[first]}',
         )
     known = ~np.isnan(values).any(axis=1)
-    wrong = known & ~(np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < ROTATION_TOLERANCE)
-    if wrong.any():
-        rows.fail(int(np.argmax(wrong)), 'the quaternion does not have length one')
+    is_invalid = known & ~(np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < ROTATION_TOLERANCE)
+    if is_invalid.any():
+        rows.fail(int(np.argmax(is_invalid)), 'the quaternion does not have length one')
     shape = (len(frames), len(names), 3)
     translation = np.full(shape, np.nan)
     rotation = np.full((*shape, 3), np.nan)
-    at = row[known], place[known]
-    translation[at] = values[known, :3]
-    rotation[at] = matrix_from_quaternion(values[known][:, [6, 3, 4, 5]])
+    index = row[known], body_index[known]
+    translation[index] = values[known, :3]
+    rotation[index] = matrix_from_quaternion(values[known][:, [6, 3, 4, 5]])
     rate = rate_of(frame, seconds * 1e9)
     return Content(bodies=Bodies(tuple(names), frames, rotation, translation, rate))
 
@@ -234,10 +234,13 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     quaternions = np.full((*known.shape, 4), np.nan)
     quaternions[known] = quaternion_from_matrix(bodies.rotation[known])
     metres = in_units(bodies.translation_mm, UNITS_MM['m'])
-    for out, kind, values in ((path, 'Quaternion', quaternions), (positions, 'Vec3', metres)):
+    for file_path, kind, values in (
+        (path, 'Quaternion', quaternions),
+        (positions, 'Vec3', metres),
+    ):
         header = (f'DataRate={frames.rate_hz!r}', f'DataType={kind}', 'version=3')
         cells = ([joined(element) for element in row] for row in values)
-        _write(out, header, bodies.names, frames.times_s, cells)
+        _write(file_path, header, bodies.names, frames.times_s, cells)
     return Written((str(path), str(positions)))
 
 
@@ -259,7 +262,7 @@ def write_joint_motion(path: PathLike, motions: Sequence[JointMotion], start_ns:
         for name in (*m.angle_names, *m.translation_names)
     ]
     values = np.hstack(
-        [part for m in motions for part in (np.rad2deg(m.angles), m.translations / 1000)]
+        [block for m in motions for block in (np.rad2deg(m.angles), m.translations / 1000)]
     )
     known = np.isfinite(values).all(axis=1)
     if not known.any():

@@ -70,18 +70,18 @@ def read(path: Path, settings: FileSettings) -> Content:
     }
     stations = rows.get('.eop', [])
     cameras = _cameras(rows, settings)
-    found: dict[str, Any] = {}
+    parts: dict[str, Any] = {}
     wanted = settings.wanted
     if 'observations' in wanted and '.pho' in rows:
-        found['observations'] = _observations(rows, cameras, settings)
+        parts['observations'] = _observations(rows, cameras, settings)
     if 'cameras' in wanted and '.iop' in rows:
-        found['cameras'] = tuple(_camera(row, cameras) for row in rows['.iop'])
+        parts['cameras'] = tuple(_camera(row, cameras) for row in rows['.iop'])
     if 'stations' in wanted and stations:
         mm = settings.unit_read(files['.eop'])
-        found['stations'] = tuple(_station(row, cameras, mm) for row in stations)
+        parts['stations'] = tuple(_station(row, cameras, mm) for row in stations)
     if 'survey' in wanted and '.xyz' in rows:
-        found['survey'] = _survey(files['.xyz'], rows['.xyz'], settings.unit_read(files['.xyz']))
-    return Content(**found)
+        parts['survey'] = _survey(files['.xyz'], rows['.xyz'], settings.unit_read(files['.xyz']))
+    return Content(**parts)
 
 
 def _rows(path: Path, width: int) -> list[Row]:
@@ -92,22 +92,22 @@ def _rows(path: Path, width: int) -> list[Row]:
 
 def _cameras(rows: Mapping[str, Sequence[Row]], settings: FileSettings) -> _Cameras:
     """Return the cameras listed in .eop and .iop, or a single one if neither exists."""
-    of_station = {
+    camera_of_station = {
         row.whole(0, 'the station'): row.whole(1, 'the camera') for row in rows.get('.eop', ())
     }
     numbers = sorted({row.whole(0, 'the camera') for row in rows.get('.iop', ())})
-    numbers = sorted(set(numbers) | set(of_station.values())) or [1]
-    if not of_station and '.pho' in rows:
+    numbers = sorted(set(numbers) | set(camera_of_station.values())) or [1]
+    if not camera_of_station and '.pho' in rows:
         if len(numbers) > 1:
             raise DataError(
                 f'{rows[".pho"][0].path}: there are {len(numbers)} cameras, and without the .eop '
                 'file nothing says which station belongs to which'
             )
-        of_station = {row.whole(1, 'the station'): numbers[0] for row in rows['.pho']}
+        camera_of_station = {row.whole(1, 'the station'): numbers[0] for row in rows['.pho']}
     names = {number: f'cam{number}' for number in numbers}
     if len(settings.fluoroscopes) == len(numbers):
         names = dict(zip(numbers, settings.fluoroscopes))
-    return _Cameras(names, of_station, _exposures(of_station))
+    return _Cameras(names, camera_of_station, _exposures(camera_of_station))
 
 
 def _exposures(of_station: Mapping[int, int]) -> dict[int, int]:
@@ -197,11 +197,11 @@ def _camera(row: Row, cameras: _Cameras) -> Camera:
 def _station(row: Row, cameras: _Cameras, mm: float) -> Station:
     number = row.whole(0, 'the station')
     values = row.numbers(2)
-    turn = Rotation.from_euler('XYZ', values[3:], degrees=True).as_matrix().T
+    rotation = Rotation.from_euler('XYZ', values[3:], degrees=True).as_matrix().T
     return Station(
         cameras.fluoroscope(number),
         cameras.exposures[number],
-        Y_UP_TO_DOWN @ turn,
+        Y_UP_TO_DOWN @ rotation,
         from_units(np.array(values[:3]), mm),
     )
 
@@ -245,10 +245,10 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
             paths.append(os.path.join(path, NAME + ending))
             write_text(paths[-1], '\n'.join(lines) + '\n')
     order = ', '.join(f'{number} is {name}' for name, number in numbering.camera.items())
-    more: tuple[str, ...] = (f'{path}: camera {order}',) if names else ()
-    if any(f.sigma is None for of in observations.values() for f in of):
-        more += (f'{path}: image points without sigma have a noise of 1 px',)
-    return Written(tuple(paths), notes + more)
+    more_notes: tuple[str, ...] = (f'{path}: camera {order}',) if names else ()
+    if any(f.sigma is None for view_frames in observations.values() for f in view_frames):
+        more_notes += (f'{path}: image points without sigma have a noise of 1 px',)
+    return Written(tuple(paths), notes + more_notes)
 
 
 class _Numbering:
@@ -257,7 +257,9 @@ class _Numbering:
     def __init__(self, names: Sequence[str], content: Content) -> None:
         self.camera = {name: number for number, name in enumerate(names, 1)}
         exposures = [s.exposure for s in content.stations]
-        exposures += [f.number for of in (content.observations or {}).values() for f in of]
+        exposures += [
+            f.number for view_frames in (content.observations or {}).values() for f in view_frames
+        ]
         self._base = 0 if len(names) < 2 else 10 ** len(str(max(exposures, default=0)))
 
     def station(self, fluoroscope: str, exposure: int) -> int:
@@ -286,8 +288,8 @@ def _iop(path: Path, camera: Camera, number: int) -> str:
 
 
 def _eop(station: Station, numbering: _Numbering, mm: float) -> str:
-    turn = (Y_UP_TO_DOWN @ station.rotation).T
-    angles = Rotation.from_matrix(turn).as_euler('XYZ', degrees=True)
+    rotation = (Y_UP_TO_DOWN @ station.rotation).T
+    angles = Rotation.from_matrix(rotation).as_euler('XYZ', degrees=True)
     number = numbering.station(station.fluoroscope, station.exposure)
     camera = numbering.camera[station.fluoroscope]
     return f'{number} {camera} {joined([*in_units(station.position_mm, mm), *angles], " ")}'

@@ -55,8 +55,8 @@ def _shifted(values: NDArray[np.float64], mm: float, sign: int) -> NDArray[np.fl
     digits = sign * round(math.log10(mm))
     if not digits:
         return values
-    moved = [float(Decimal(repr(value)).scaleb(digits)) for value in values.ravel().tolist()]
-    return np.array(moved).reshape(values.shape)
+    scaled = [float(Decimal(repr(value)).scaleb(digits)) for value in values.ravel().tolist()]
+    return np.array(scaled).reshape(values.shape)
 
 
 @dataclass(frozen=True)

@@ -105,9 +105,9 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
     shape = (len(frames), len(targets))
 
     def table(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        out = np.full(shape, np.nan)
-        out[row, column] = values
-        return out
+        array = np.full(shape, np.nan)
+        array[row, column] = values
+        return array
 
     xyz = np.stack([table(numbers[axis]) for axis in 'xyz'], axis=2)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
@@ -141,14 +141,14 @@ def _write_points(path: Path, content: Content, settings: FileSettings) -> Writt
 def _point_rows(
     points: Points, rate: float | None, named: Mapping[int, str]
 ) -> Iterator[list[object]]:
-    first = int(points.frame[0])
+    first_frame = int(points.frame[0])
     for row, column in np.argwhere(~np.isnan(points.xyz_mm[..., 0])).tolist():
         number = int(points.frame[row])
         target = int(points.target_id[column])
         cells = {
             **dict.fromkeys(POINTS, ''),
             'frame': number,
-            'stamp_ns': '' if rate is None else round((number - first) / rate * 1e9),
+            'stamp_ns': '' if rate is None else round((number - first_frame) / rate * 1e9),
             'target_id': target,
             **dict(zip('xyz', points.xyz_mm[row, column].tolist())),
             'residual': float(points.residual_px[row, column]),
@@ -221,7 +221,8 @@ def read(path: Path, settings: FileSettings) -> Content:
     """Read the cameras. Raises DataError."""
     return Content(
         cameras=tuple(
-            _camera(name, known, settings) for name, known in read_known_orientations(path).items()
+            _camera(name, orientation, settings)
+            for name, orientation in read_known_orientations(path).items()
         )
     )
 
@@ -234,13 +235,13 @@ def _camera(name: str, known: KnownOrientation, settings: FileSettings) -> Camer
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write all cameras into one file. Raises DataError."""
-    known = {}
+    orientations = {}
     for camera in content.cameras:
         refuse_distortion(path, camera, TITLE)
         common_focal_length(path, camera, TITLE)
         with ErrorsAt(f'camera {camera.name}'):
-            known[camera.name] = KnownOrientation.from_matrices(camera.matrix, *camera.pose)
-    write_known_orientations(path, known)
+            orientations[camera.name] = KnownOrientation.from_matrices(camera.matrix, *camera.pose)
+    write_known_orientations(path, orientations)
     return Written((str(path),))
 
 
@@ -303,24 +304,24 @@ def _orientation(entry: Any, where: str) -> KnownOrientation:
         )
     except (TypeError, ValueError, OverflowError) as error:
         # DataError is a ValueError.
-        sentence = error if isinstance(error, DataError) else 'a value is not a number'
-        raise DataError(f'{where}: {sentence}') from None
+        cause = error if isinstance(error, DataError) else 'a value is not a number'
+        raise DataError(f'{where}: {cause}') from None
 
 
 def write_known_orientations(path: PathLike, known: Mapping[str, KnownOrientation]) -> None:
     """Write known orientations; reading the file restores them. Raises DataError."""
     entries: dict[str, Any] = {}
-    for name, one in known.items():
-        xp, yp, c = one.interior.tolist()
+    for name, orientation in known.items():
+        xp, yp, c = orientation.interior.tolist()
         entry: dict[str, Any] = {
             'K': [[c, 0.0, xp], [0.0, c, yp], [0.0, 0.0, 1.0]],
-            'R': one.rotation.tolist(),
-            't_mm': (-one.rotation @ one.position_mm).tolist(),
+            'R': orientation.rotation.tolist(),
+            't_mm': (-orientation.rotation @ orientation.position_mm).tolist(),
         }
-        if one.interior_sd is not None:
-            entry['interior_sd_px'] = list(one.interior_sd)
-        if one.exterior_sd is not None:
-            entry['exterior_sd'] = list(one.exterior_sd)
+        if orientation.interior_sd is not None:
+            entry['interior_sd_px'] = list(orientation.interior_sd)
+        if orientation.exterior_sd is not None:
+            entry['exterior_sd'] = list(orientation.exterior_sd)
         entries[name] = entry
     document = {'format_version': VERSION, 'fluoroscopes': entries}
     write_text(path, yaml.safe_dump(document, sort_keys=False))

@@ -55,8 +55,8 @@ def _appendable(group: Any) -> tuple[NDArray[np.str_], NDArray[np.str_], NDArray
     if set(table.dtype.names) != {'index', VALUES}:
         raise ValueError('its columns are not of one kind')
     rows = table[:]
-    (_, columns), *others = literal(bytes(group.attrs['non_index_axes']))
-    if others:
+    (_, columns), *other_axes = literal(bytes(group.attrs['non_index_axes']))
+    if other_axes:
         raise ValueError('it has more than two axes')
     return np.array(columns, dtype=str), np.array(texts(rows['index'])), rows[VALUES].astype(float)
 
@@ -76,14 +76,14 @@ def _levels(group: Any, axis: str) -> list[list[str]]:
     """Return the texts of each level of an axis."""
     if axis in group:
         return [texts(group[axis][:])]
-    out = []
+    levels = []
     for level in range(int(group.attrs[f'{axis}_nlevels'])):
         names = texts(group[f'{axis}_level{level}'][:])
         labels = group[f'{axis}_label{level}'][:]
         if len(labels) and not 0 <= labels.min() <= labels.max() < len(names):
             raise ValueError('an index of its columns is not known')
-        out.append([names[label] for label in labels])
-    return out
+        levels.append([names[label] for label in labels])
+    return levels
 
 
 def literal(pickled: bytes) -> Any:
@@ -100,8 +100,8 @@ def literal(pickled: bytes) -> Any:
         elif name in _VALUES:
             stack.append(argument)
         elif name in _MAKERS:
-            begin = len(stack) - 1 - stack[::-1].index(_MARK)
-            stack[begin:] = [_MAKERS[name](stack[begin + 1 :])]
+            mark_index = len(stack) - 1 - stack[::-1].index(_MARK)
+            stack[mark_index:] = [_MAKERS[name](stack[mark_index + 1 :])]
         elif name == 'APPEND':
             value = stack.pop()
             stack[-1].append(value)

@@ -74,9 +74,9 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
     beads = rows if layout is None else rows[1:]
     if not beads:
         raise DataError(f'{path}: the file has a header, but no beads')
-    most = read_limits().max_targets
-    if len(beads) > most:
-        raise DataError(f'{path}: phantoms of more than {most} targets are not read')
+    max_targets = read_limits().max_targets
+    if len(beads) > max_targets:
+        raise DataError(f'{path}: phantoms of more than {max_targets} targets are not read')
     if layout is None:
         layout = _of_numbers(rows)
     for row in beads:
@@ -98,8 +98,8 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
 
 def _separator(lines: Sequence[str]) -> str:
     """Return the separator found in the second row, ' ' for blanks."""
-    first = lines[1] if len(lines) > 1 else ''.join(lines)
-    return next((mark for mark in ';\t,' if mark in first), ' ')
+    sample_line = lines[1] if len(lines) > 1 else ''.join(lines)
+    return next((mark for mark in ';\t,' if mark in sample_line), ' ')
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -114,19 +114,19 @@ def _header(cells: Sequence[str]) -> _Layout | None:
     columns: dict[str, int] = {}
     units = set()
     for number, cell in enumerate(cells):
-        found = _COLUMN.fullmatch(cell.strip().lower())
-        if found is None:
+        match = _COLUMN.fullmatch(cell.strip().lower())
+        if match is None:
             continue
-        name = _SAME.get(found[1], found[1])
+        name = _SAME.get(match[1], match[1])
         if name in columns:
             return None
         columns[name] = number
-        if found[2] and name in ('x', 'y', 'z'):
-            units.add(found[2])
+        if match[2] and name in ('x', 'y', 'z'):
+            units.add(match[2])
     if not {'x', 'y', 'z'} <= set(columns) or _OTHERS & {cell.lower() for cell in cells}:
         return None
-    known = {name: columns[name] for name in _KNOWN if name in columns}
-    return _Layout(known, ''.join(units) if len(units) == 1 else None)
+    known_columns = {name: columns[name] for name in _KNOWN if name in columns}
+    return _Layout(known_columns, ''.join(units) if len(units) == 1 else None)
 
 
 def _without_header(cells: Sequence[str]) -> tuple[str, ...]:
@@ -165,13 +165,13 @@ def _unit(path: Path, layout: _Layout, settings: FileSettings) -> float:
 
 def _numbers(row: Row, layout: _Layout, names: Sequence[str]) -> list[float]:
     """Return the numbers of some columns. Raises DataError that names the column."""
-    out = []
+    numbers = []
     for name in names:
         cell = row.cells[layout.columns[name]]
         if not is_number(cell) or not np.isfinite(float(cell)):
             row.fail(f'{name} is {quoted(cell)}, not a finite number')
-        out.append(float(cell))
-    return out
+        numbers.append(float(cell))
+    return numbers
 
 
 def _positive(rows: Sequence[Row], layout: _Layout, name: str) -> NDArray[np.float64]:
@@ -186,13 +186,13 @@ def _ids(rows: Sequence[Row], layout: _Layout) -> dict[str, int]:
     if 'id' not in layout.columns:
         return {str(number): number for number in range(1, len(rows) + 1)}
     cells = [row.cells[layout.columns['id']] for row in rows]
-    first: dict[str, Row] = {}
+    first_rows: dict[str, Row] = {}
     for row, cell in zip(rows, cells):
         if not cell:
             row.fail('the bead has no id')
-        other = first.setdefault(cell, row)
-        if other is not row:
-            row.fail(f'bead {quoted(cell)} is already given in row {other.line}')
+        first_row = first_rows.setdefault(cell, row)
+        if first_row is not row:
+            row.fail(f'bead {quoted(cell)} is already given in row {first_row.line}')
     if not all(cell.isascii() and cell.isdigit() for cell in cells):
         return number_names(cells)
     for row, cell in zip(rows, cells):
@@ -245,18 +245,20 @@ def content_of(path: Path, text: str, settings: FileSettings) -> Content:
         raise DataError(f'{path}: the file has a header, but no beads')
     mm, notes = settings.unit_or('cm', str(path))
     xyz = from_units(np.array([_bead(row) for row in beads]) * scale, mm)
-    given = [row.cells[3] if len(row.cells) > 3 else '' for row in beads]
-    if any(given) and not all(given):
-        index = given.index('')
+    bead_names = [row.cells[3] if len(row.cells) > 3 else '' for row in beads]
+    if any(bead_names) and not all(bead_names):
+        index = bead_names.index('')
         beads[index].fail('the bead has no name, but others have one')
-    ids = number_names(given if all(given) else [str(i) for i in range(1, len(beads) + 1)])
+    ids = number_names(
+        bead_names if all(bead_names) else [str(i) for i in range(1, len(beads) + 1)]
+    )
     if len(ids) < len(beads):
-        index = next(i for i, name in enumerate(given) if name in given[:i])
-        beads[index].fail(f'the bead {given[index]!r} is given twice')
-    sd, of_sd = _sd_unsaid(path, len(xyz), settings)
+        index = next(i for i, name in enumerate(bead_names) if name in bead_names[:i])
+        beads[index].fail(f'the bead {bead_names[index]!r} is given twice')
+    sd, sd_notes = _sd_unsaid(path, len(xyz), settings)
     with ErrorsAt(path):
         survey = Phantom(np.array(list(ids.values())), xyz, sd)
-    return Content(survey=survey, names=Names(without_trivial(ids)), notes=(*notes, *of_sd))
+    return Content(survey=survey, names=Names(without_trivial(ids)), notes=(*notes, *sd_notes))
 
 
 def _sd_unsaid(
@@ -288,16 +290,16 @@ def _write_framespec(path: Path, content: Content, settings: FileSettings) -> Wr
     survey = content.survey
     assert survey is not None
     mm, notes = settings.unit_or('cm', str(path))
-    named = content.names.target_names()
+    target_names = content.names.target_names()
     lines = ['x y z']
     for target, xyz in zip(survey.target_id.tolist(), in_units(survey.xyz_mm, mm)):
-        name = named.get(target, str(target))
+        name = target_names.get(target, str(target))
         if set(name) & set(',;\n'):
             raise DataError(f'{path}: a bead cannot be called {name!r} in this format')
         lines.append(f'{joined(xyz)},{name}')
     write_text(path, '\n'.join(lines) + '\n')
-    lost = f'{path}: the format has no standard deviation, those of the survey are lost'
-    return Written((str(path),), (*notes, lost))
+    loss_note = f'{path}: the format has no standard deviation, those of the survey are lost'
+    return Written((str(path),), (*notes, loss_note))
 
 
 FRAMESPEC = Format(

@@ -52,30 +52,32 @@ def read_deeplabcut(path: Path, settings: FileSettings) -> Content:
     with path.open('rb') as file:
         is_hdf5 = file.read(len(HDF5)) == HDF5
     rows = _rows_of_hdf5(path) if is_hdf5 else read_table(path, ',')
-    top = {row.cells[0].lower(): row for row in rows[: len(HEADER)]}
-    header = {name: row for name, row in top.items() if name in HEADER}
-    body = rows[len(header) :]
+    top_rows = {row.cells[0].lower(): row for row in rows[: len(HEADER)]}
+    header = {name: row for name, row in top_rows.items() if name in HEADER}
+    frame_rows = rows[len(header) :]
     coords = header.get('coords')
-    if coords is None or 'bodyparts' not in header or not body:
+    if coords is None or 'bodyparts' not in header or not frame_rows:
         rows[0].fail('a DeepLabCut table has rows scorer, bodyparts and coords, and then frames')
-    require_width([*header.values(), *body], len(coords.cells), 'the row coords')
-    first = next((k for k, cell in enumerate(coords.cells) if k and cell), len(coords.cells))
-    targets = _body_parts(header, first)
+    require_width([*header.values(), *frame_rows], len(coords.cells), 'the row coords')
+    first_column = next(
+        (k for k, cell in enumerate(coords.cells) if k and cell), len(coords.cells)
+    )
+    targets = _body_parts(header, first_column)
     target_id, names = numbered_targets(targets, settings.names.targets)
     size = settings.image_size_of(path)
     fluoroscope = _fluoroscope_of_table(path, settings)
     frames: dict[int, Frame] = {}
     likelihood: list[NDArray[np.float64]] = []
-    unsure = 0
-    for row in body:
-        values = np.array(row.numbers_or_nan(first)).reshape(len(targets), -1)
+    unsure_count = 0
+    for row in frame_rows:
+        values = np.array(row.numbers_or_nan(first_column)).reshape(len(targets), -1)
         seen = np.isfinite(values[:, :2]).all(axis=1)
         if values.shape[1] == 3:
-            likely = values[:, 2] >= LIKELIHOOD
-            unsure += np.count_nonzero(seen & ~likely)
-            seen &= likely
+            is_likely = values[:, 2] >= LIKELIHOOD
+            unsure_count += np.count_nonzero(seen & ~is_likely)
+            seen &= is_likely
         if seen.any():
-            number = _frame_number(row, first)
+            number = _frame_number(row, first_column)
             if number in frames:
                 row.fail(f'frame {number} is given twice')
             points = (target_id[seen], values[seen, :2])
@@ -83,12 +85,13 @@ def read_deeplabcut(path: Path, settings: FileSettings) -> Content:
             likelihood.append(values[seen, 2] if values.shape[1] == 3 else np.ones(seen.sum()))
     observed = with_sigma_of_likelihood(list(frames.values()), likelihood)
     notes = (
-        f'{path}: {unsure} points with a likelihood below {LIKELIHOOD} (pcutoff) are not used',
+        f'{path}: {unsure_count} points with a likelihood below {LIKELIHOOD} (pcutoff) are not '
+        'used',
     )
     return Content(
         observations={fluoroscope: observed} if observed else {},
         names=names,
-        notes=notes if unsure else (),
+        notes=notes if unsure_count else (),
     )
 
 
@@ -221,12 +224,12 @@ def read_sleap(path: Path, settings: FileSettings) -> Content:
         frames.append(frame_of(where, fluoroscope, number, *points, size))
     likelihood = [score[frame.number, seen[frame.number]] for frame in frames]
     frames = with_sigma_of_likelihood(frames, likelihood)
-    unsure = int(np.count_nonzero(placed & ~seen))
+    unsure_count = int(np.count_nonzero(placed & ~seen))
     return Content(
         observations={fluoroscope: frames} if frames else {},
         names=names,
-        notes=(f'{path}: {unsure} points are not used, their score is 0 or no score',)
-        if unsure
+        notes=(f'{path}: {unsure_count} points are not used, their score is 0 or no score',)
+        if unsure_count
         else (),
     )
 
@@ -247,8 +250,8 @@ def _nodes(path: Path, arrays: dict[str, np.ndarray]) -> list[str]:
 def _fluoroscope_of_video(path: Path, settings: FileSettings) -> str:
     """Return the fluoroscope of a file <project>.000_<video>.analysis.h5: its video."""
     name = path.name.removesuffix(path.suffix).removesuffix('.analysis')
-    found = _OF_VIDEO.fullmatch(name)
-    return settings.fluoroscope_of(found['video'] if found else name, path)
+    match = _OF_VIDEO.fullmatch(name)
+    return settings.fluoroscope_of(match['video'] if match else name, path)
 
 
 def write_sleap(path: Path, content: Content, settings: FileSettings) -> Written:

@@ -103,7 +103,7 @@ def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     names = names[: xyz.shape[1]]
     if len(set(names)) < xyz.shape[1]:
         raise DataError(f'{path}: {xyz.shape[1]} points, but {len(set(names))} different names')
-    target_id, named = numbered_targets(names, settings.names.targets)
+    target_id, content_names = numbered_targets(names, settings.names.targets)
     xyz = np.where((residual < 0)[..., None], np.nan, xyz * mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     sd = np.where(residual > 0, residual * mm, np.nan)
@@ -115,7 +115,7 @@ def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
         residual_px=np.full(sd.shape, np.nan),
         rate_hz=float(arrays['rate']),
     )
-    return Content(points=points, names=named)
+    return Content(points=points, names=content_names)
 
 
 def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -> Bodies:
@@ -130,19 +130,19 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     rotation = matrices[..., :3, :3].copy()
     translation = matrices[..., :3, 3] * mm
     missing = np.isnan(matrices).any(axis=(2, 3))
-    turn = np.where(missing[..., None, None], np.eye(3), rotation)
-    wrong = ~is_rotation(turn, TAKEN_TOLERANCE)
-    first = int(arrays['first'])
-    if wrong.any():
-        row, column = np.argwhere(wrong)[0]
+    known_rotation = np.where(missing[..., None, None], np.eye(3), rotation)
+    is_invalid = ~is_rotation(known_rotation, TAKEN_TOLERANCE)
+    first_frame = int(arrays['first'])
+    if is_invalid.any():
+        row, column = np.argwhere(is_invalid)[0]
         raise DataError(
-            f'{path}, frame {first + row}: the matrix of {names[column]} is not a rotation'
+            f'{path}, frame {first_frame + row}: the matrix of {names[column]} is not a rotation'
         )
     rotation[missing] = np.nan
     translation[missing] = np.nan
     return Bodies(
         tuple(names),
-        first + np.arange(len(matrices)),
+        first_frame + np.arange(len(matrices)),
         rotation,
         translation,
         rate_hz=float(arrays['rotation_rate']),
@@ -207,11 +207,11 @@ def _add_points(file: Any, points: Points, mm: float) -> None:
     """Add points of all frames to a file, in a unit of `mm` millimetres, with their residuals."""
     missing = np.asarray(np.isnan(points.xyz_mm).any(axis=2))
     xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
-    with_one = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
+    homogeneous_xyz = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
     sd = np.nan_to_num(points.sd_mm / mm)
     step = max(float(sd.max(initial=0.0)) / 255, 1e-6)
     file['parameters']['POINT']['SCALE']['value'] = [-step]
-    file['data']['points'] = with_one.transpose(2, 1, 0)
+    file['data']['points'] = homogeneous_xyz.transpose(2, 1, 0)
     file['data']['meta_points']['residuals'] = np.where(missing, -1.0, sd).T[None]
 
 
@@ -260,32 +260,32 @@ def _is_xmalab3d(sample: Sample) -> bool:
 
 def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
     """Read 3-D points. Raises DataError."""
-    header, body, first = read_frames(path)
-    targets = _targets(header, first)
-    require_width(body, 3 * len(targets) + first, 'the header')
+    header, rows, first_column = read_frames(path)
+    targets = _targets(header, first_column)
+    require_width(rows, 3 * len(targets) + first_column, 'the header')
     mm = settings.unit_read(path)
-    target_id, named = numbered_targets(targets, settings.names.targets)
-    frame = frame_numbers(body, first)
-    for before, row, number in zip(frame, body[1:], frame[1:]):
-        if number <= before:
-            row.fail(f'frame {number} comes after frame {before}')
-    values = np.array([row.numbers_or_nan(first) for row in body])
-    xyz = from_units(values.reshape(len(body), -1, 3), mm)
+    target_id, content_names = numbered_targets(targets, settings.names.targets)
+    frame = frame_numbers(rows, first_column)
+    for previous, row, number in zip(frame, rows[1:], frame[1:]):
+        if number <= previous:
+            row.fail(f'frame {number} comes after frame {previous}')
+    values = np.array([row.numbers_or_nan(first_column) for row in rows])
+    xyz = from_units(values.reshape(len(rows), -1, 3), mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     points = points_without_precision(np.array(frame), target_id, xyz, settings.rate_hz)
-    return Content(points=points, names=named)
+    return Content(points=points, names=content_names)
 
 
 def _targets(row: Row, first: int) -> list[str]:
     """Return the names of the targets in a header. Raises DataError."""
-    found = []
+    names = []
     for cell, axis in zip(row.cells[first:], 'XYZ' * len(row.cells)):
         match = _COLUMN.fullmatch(cell)
         if match is None or match['axis'].upper() != axis:
             row.fail(f'the column {cell!r} is not <name>_{axis}')
-        found.append(match['target'])
-    targets = found[::3]
-    if len(found) % 3 or found != [name for name in targets for _ in 'XYZ']:
+        names.append(match['target'])
+    targets = names[::3]
+    if len(names) % 3 or names != [name for name in targets for _ in 'XYZ']:
         row.fail('the columns are not triples <name>_X,<name>_Y,<name>_Z')
     for name in targets:
         if targets.count(name) > 1:
@@ -358,10 +358,11 @@ def _read_trc(path: Path, settings: FileSettings) -> Content:
             xyz.append(_coordinates(row, count))
     if not frame:
         raise DataError(f'{path}: the file has no frames')
-    target_id, named = numbered_targets(names, settings.names.targets)
+    target_id, content_names = numbered_targets(names, settings.names.targets)
     xyz_mm = from_units(np.array(xyz), mm)
     return Content(
-        points=points_without_precision(np.array(frame), target_id, xyz_mm, rate), names=named
+        points=points_without_precision(np.array(frame), target_id, xyz_mm, rate),
+        names=content_names,
     )
 
 
@@ -386,8 +387,8 @@ def _write_trc(path: Path, content: Content, settings: FileSettings) -> Written:
     names = labels(content)
     rate = number_text(points.rate_hz or math.nan)
     frames = str(len(points.frame))
-    first = int(points.frame[0])
-    values = [rate, rate, frames, str(len(names)), unit, rate, str(first), frames]
+    first_frame = int(points.frame[0])
+    values = [rate, rate, frames, str(len(names)), unit, rate, str(first_frame), frames]
     axes = [f'{axis}{number}' for number in range(1, len(names) + 1) for axis in 'XYZ']
     with atomic_file(path, 'w') as file:
         file.write(f'PathFileType\t4\t(X/Y/Z)\t{path.name}\n')
@@ -395,7 +396,7 @@ def _write_trc(path: Path, content: Content, settings: FileSettings) -> Written:
         file.write('Frame#\tTime\t' + '\t\t\t'.join(names) + '\t\t\n')
         file.write('\t\t' + '\t'.join(axes) + '\n\n')
         for number, xyz in zip(points.frame.tolist(), in_units(points.xyz_mm, UNITS_MM[unit])):
-            time = (number - first) / points.rate_hz
+            time = (number - first_frame) / points.rate_hz
             file.write(f'{number}\t{time!r}\t{joined(xyz.ravel(), TAB)}\n')
     return Written((str(path),), (f'{path}: TRC has no residuals',))
 

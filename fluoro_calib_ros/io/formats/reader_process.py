@@ -37,12 +37,12 @@ MAX_MEMORY = 8 * 2**30
 
 def labels_of(parameters: Any) -> list[str]:
     """Return all point names: one parameter contains 255, the others follow in LABELS2, ..."""
-    found = list(parameters['LABELS']['value'])
+    labels = list(parameters['LABELS']['value'])
     number = 2
     while f'LABELS{number}' in parameters:
-        found += parameters[f'LABELS{number}']['value']
+        labels += parameters[f'LABELS{number}']['value']
         number += 1
-    return [str(label).strip() for label in found]
+    return [str(label).strip() for label in labels]
 
 
 def c3d_arrays(path: str) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def _residuals(path: str, xyz: NDArray[np.float64], scale: float) -> NDArray[np.
     which is the camera mask.
     """
     content = Path(path).read_bytes()
-    analog, data = (int.from_bytes(content[place : place + 2], 'little') for place in (4, 16))
+    analog, data = (int.from_bytes(content[offset : offset + 2], 'little') for offset in (4, 16))
     frames, points, _ = xyz.shape
     width = 4 * points + analog
     kind = '<f4' if scale < 0 else '<i2'
@@ -181,15 +181,17 @@ def arrays_apart(kind: str, path: Path, title: str) -> dict[str, np.ndarray]:
     """Return the arrays of a file, read in a separate process. Raises DataError if that fails."""
     seconds = BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size
     try:
-        done = run_module(__name__, kind, os.fspath(path.resolve()), timeout_s=seconds)
+        process = run_module(__name__, kind, os.fspath(path.resolve()), timeout_s=seconds)
     except TimeoutError:
         raise DataError(f'{path}: this {title} file cannot be read, it is damaged') from None
-    if done.returncode:
-        cause = done.stderr.decode('utf-8', 'replace').strip() if done.returncode == 1 else ''
+    if process.returncode:
+        cause = (
+            process.stderr.decode('utf-8', 'replace').strip() if process.returncode == 1 else ''
+        )
         raise DataError(
             f'{path}: this {title} file cannot be read ({cause or "it is damaged"})'
         ) from None
-    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+    with np.load(io.BytesIO(process.stdout), allow_pickle=False) as arrays:
         return dict(arrays)
 
 

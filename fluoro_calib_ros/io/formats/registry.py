@@ -95,8 +95,8 @@ def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Con
     path = Path(path)
     if path.is_dir():
         return _read_folder(path, settings, kind)
-    found = recognised(path)
-    format_ = found if kind is None else FORMATS[kind]
+    recognised_format = recognised(path)
+    format_ = recognised_format if kind is None else FORMATS[kind]
     if format_ is None:
         raise DataError(f'{path}: the format is not known; {_beginning(path)}')
     if format_.read is None:
@@ -104,9 +104,11 @@ def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Con
     try:
         return format_.read(path, settings)
     except DataError as error:
-        if found is None or found is format_:
+        if recognised_format is None or recognised_format is format_:
             raise
-        raise DataError(f'{error}; the file looks like {found.title} ({found.kind})') from None
+        raise DataError(
+            f'{error}; the file looks like {recognised_format.title} ({recognised_format.kind})'
+        ) from None
 
 
 def _beginning(path: Path) -> str:
@@ -130,18 +132,20 @@ def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Cont
         # A target must have the same id in all files.
         settings = replace(settings, names=settings.names.merged(content.names))
         contents[path] = (format_.kind, content)
-    found = dict.fromkeys(name for name, _ in contents.values())
-    if len(found) != 1:
-        what = f'files of {" and ".join(found)}' if found else 'no file of cameras'
+    kinds_found = dict.fromkeys(name for name, _ in contents.values())
+    if len(kinds_found) != 1:
+        contained = (
+            f'files of {" and ".join(kinds_found)}' if kinds_found else 'no file of cameras'
+        )
         raise DataError(
-            f'{folder}: the folder has {what}, but should be a result folder or have a file of '
-            'one format for each camera'
+            f'{folder}: the folder has {contained}, but should be a result folder or have a file '
+            'of one format for each camera'
         )
     cameras = [camera for _, content in contents.values() for camera in content.cameras]
     lookups = {n: maps for _, content in contents.values() for n, maps in content.lookups.items()}
     notes = tuple(dict.fromkeys(n for _, content in contents.values() for n in content.notes))
     for camera in cameras:
-        if sum(other.name == camera.name for other in cameras) > 1:
+        if sum(candidate.name == camera.name for candidate in cameras) > 1:
             raise DataError(f'{folder}: two cameras are called {camera.name!r}')
     observations: dict[str, Sequence[Frame]] = {}
     for path, (_, content) in contents.items():
@@ -172,8 +176,8 @@ def write(path: PathLike, kind: str, content: Content, settings: FileSettings) -
     parts = [name for name in format_.parts if has_content(getattr(content, name))]
     if not parts:
         needed = ' or '.join(PARTS[name] for name in format_.parts)
-        has = (
+        available = (
             ' and '.join(PARTS[name] for name in content.parts) or 'nothing that can be converted'
         )
-        raise DataError(f'{format_.title} needs {needed}, but the source has {has}')
+        raise DataError(f'{format_.title} needs {needed}, but the source has {available}')
     return format_.write(Path(path), content, settings)

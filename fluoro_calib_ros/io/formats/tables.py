@@ -92,7 +92,7 @@ class Row:
 
     def numbers_or_nan(self, first: int = 0) -> list[float]:
         """Return the cells from column `first` on as numbers, NaN for missing ones."""
-        out = []
+        values = []
         for column, cell in enumerate(self.cells[first:], first):
             try:
                 if '_' in cell:  # Python reads 1_0 as 10
@@ -102,8 +102,8 @@ class Row:
                 value = math.inf
             if math.isinf(value):
                 self.fail(f'column {column + 1} is {quoted(cell)}, not a number')
-            out.append(value)
-        return out
+            values.append(value)
+        return values
 
     def whole(self, column: int, what: str) -> int:
         """Return a cell as a non-negative integer. Raises DataError."""
@@ -140,8 +140,8 @@ def table_of(path: PathLike, text: str, separator: str | None = None) -> list[Ro
 
 def separator_of(text: str) -> str:
     """Return the separator found in the first row that is not blank."""
-    first = next((line for line in text.splitlines() if line.strip()), '')
-    return next((mark for mark in ';\t' if mark in first), ',')
+    first_line = next((line for line in text.splitlines() if line.strip()), '')
+    return next((mark for mark in ';\t' if mark in first_line), ',')
 
 
 def _separated(path: PathLike, text: str, separator: str) -> list[Row]:
@@ -219,8 +219,10 @@ def numbered_targets(
 ) -> tuple[NDArray[np.int64], Names]:
     """Return the ids (n,) of targets named in a file, and the names given by a person."""
     ids = number_names(targets, known)
-    own = {name: ids[name] for name in targets}
-    return np.array([own[name] for name in targets], dtype=np.int64), Names(named_targets(own))
+    target_ids = {name: ids[name] for name in targets}
+    return np.array([target_ids[name] for name in targets], dtype=np.int64), Names(
+        named_targets(target_ids)
+    )
 
 
 def are_numbers(lines: Sequence[str], rows: int, columns: int = 0) -> bool:
@@ -254,9 +256,9 @@ class Frames:
         self, frame: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Expand the values (k, ...) of frames (k,) to all frames (m, ...), NaN where missing."""
-        out = np.full((self.count, *values.shape[1:]), np.nan)
-        out[frame - self.first] = values
-        return out
+        expanded = np.full((self.count, *values.shape[1:]), np.nan)
+        expanded[frame - self.first] = values
+        return expanded
 
 
 def frames_of(
@@ -273,11 +275,13 @@ def frames_of(
     rate = next((rate for rate in rates if rate), None if needs_rate else math.nan)
     if rate is None:
         raise DataError(f'{path}: the source does not contain the frame rate, --rate HZ is needed')
-    first = min(int(part.frame[0]) for part in parts)
-    count = max(int(part.frame[-1]) for part in parts) - first + 1
+    first_frame = min(int(part.frame[0]) for part in parts)
+    count = max(int(part.frame[-1]) for part in parts) - first_frame + 1
     if count > MAX_ROWS:
-        raise DataError(f'{path}: frames {first} to {first + count - 1} are too many to write')
-    return Frames(first, count, float(rate))
+        raise DataError(
+            f'{path}: frames {first_frame} to {first_frame + count - 1} are too many to write'
+        )
+    return Frames(first_frame, count, float(rate))
 
 
 def points_of(points: Points, frames: Frames) -> Points:
@@ -311,13 +315,13 @@ def rate_of(frame: NDArray[np.int64], stamp_ns: np.ndarray) -> float | None:
     if not seconds > 0:
         return None
     rate = (frame[last] - frame[first]) / seconds
-    whole = round(rate)
+    rounded = round(rate)
     # A clock is off by some millionths, and stamps are rounded to nanoseconds.
-    return float(whole) if whole and abs(rate - whole) < 1e-5 * whole else float(rate)
+    return float(rounded) if rounded and abs(rate - rounded) < 1e-5 * rounded else float(rate)
 
 
 def labels(content: Content) -> list[str]:
     """Return the names of the targets; a target without a name is marker001, marker002, ..."""
     assert content.points is not None
-    named = content.names.target_names()
-    return [named.get(i, default_name(i)) for i in content.points.target_id.tolist()]
+    target_names = content.names.target_names()
+    return [target_names.get(i, default_name(i)) for i in content.points.target_id.tolist()]

@@ -230,11 +230,11 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
     ones = np.ones((len(columns), 1))
     projections = np.concatenate([columns, ones], axis=1).reshape(-1, 3, 4)
     downwards = bool((np.linalg.det(projections[:, :, :3]) > 0).all())
-    to_ours = np.linalg.inv(_file_pixels(size, downwards))
+    to_pixels = np.linalg.inv(_file_pixels(size, downwards))
     cameras = []
     for name, projection in zip(names, projections):
         try:
-            cameras.append(_dlt_camera(name, to_ours @ projection, size, mm))
+            cameras.append(_dlt_camera(name, to_pixels @ projection, size, mm))
         except ValueError as error:
             raise DataError(f'{path}, {name}: {error}') from None
     note = f'{path}: rows count downwards, as in DLTdv8, or the origin would be behind the cameras'
@@ -320,21 +320,22 @@ def read(path: Path, settings: FileSettings) -> Content:
     separator = separator_of(text)
     if separator == ';':
         lines = [(n, line.replace(',', '.')) for n, line in lines]
-    first = np.array(_float32_numbers(path, *lines[0], separator), dtype=np.float32)
+    first_row = np.array(_float32_numbers(path, *lines[0], separator), dtype=np.float32)
     if len(lines) % 2 or len(lines) < 2:
         raise DataError(
             f'{path}: {len(lines)} rows, but a lookup table has as many for the rows as for the '
             'columns of the map'
         )
-    table = np.empty((len(lines), len(first)), dtype=np.float32)
+    table = np.empty((len(lines), len(first_row)), dtype=np.float32)
     for index, (number, line) in enumerate(lines):
         values = _float32_numbers(path, number, line, separator)
-        if len(values) != len(first):
+        if len(values) != len(first_row):
             raise DataError(
-                f'{path}, row {number}: {len(values)} columns, but the first row has {len(first)}'
+                f'{path}, row {number}: {len(values)} columns, but the first row has '
+                f'{len(first_row)}'
             )
         table[index] = values
-    maps = table.reshape(2, -1, len(first))
+    maps = table.reshape(2, -1, len(first_row))
     size = (maps.shape[2], maps.shape[1])
     if settings.image_size not in (None, size):
         raise DataError(

@@ -44,18 +44,18 @@ _OFFSET = re.compile(r'cam\d+_offset', re.IGNORECASE)
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read image points. Raises DataError."""
-    top, body, first = read_frames(path)
-    header, offsets = _header(top, first)
-    require_width(body, len(header) + offsets + first, 'the header')
+    top, rows, first_column = read_frames(path)
+    header, offsets = _header(top, first_column)
+    require_width(rows, len(header) + offsets + first_column, 'the header')
     cameras = sorted({camera for _, camera in header})
     column_id, names = numbered_targets([name for name, _ in header[::2]], settings.names.targets)
     labels = _labels(cameras, settings)
     frames: dict[str, list[Frame]] = {labels[camera]: [] for camera in cameras}
     column_camera = np.array([camera for _, camera in header[::2]])
     size = settings.image_size_of(path)
-    for number, row in zip(frame_numbers(body, first), body):
-        _check_offsets(row, first, offsets)
-        uv = _pixels(row.numbers_or_nan(first + offsets), settings, size)
+    for number, row in zip(frame_numbers(rows, first_column), rows):
+        _check_offsets(row, first_column, offsets)
+        uv = _pixels(row.numbers_or_nan(first_column + offsets), settings, size)
         _check_point(row, uv, size, header)
         for camera in cameras:
             used = (column_camera == camera) & ~np.isnan(uv).any(axis=1)
@@ -64,7 +64,7 @@ def read(path: Path, settings: FileSettings) -> Content:
                 points = (column_id[used], uv[used])
                 frames[name].append(frame_of(row.place, name, number, *points, size))
     return Content(
-        observations={name: of_camera for name, of_camera in frames.items() if of_camera},
+        observations={name: view_frames for name, view_frames in frames.items() if view_frames},
         names=names,
         notes=_origin_notes(path, top, settings),
     )
@@ -74,10 +74,10 @@ def _origin_notes(path: Path, header: Row, settings: FileSettings) -> tuple[str,
     """Return advice about the pixel origin if the column names suggest another program."""
     if settings.one_based or settings.y_up:
         return ()
-    last = header.cells[-1]
-    if re.fullmatch(r'pt\d+_cam\d+_Y', last):
+    last_column = header.cells[-1]
+    if re.fullmatch(r'pt\d+_cam\d+_Y', last_column):
         return (f'{path}: of DLTdv8, add --one-based; of DLTdv5 to 7, --one-based --y-up',)
-    return (f'{path}: of Argus, add --y-up',) if re.search(r'_cam_\d+_y$', last) else ()
+    return (f'{path}: of Argus, add --y-up',) if re.search(r'_cam_\d+_y$', last_column) else ()
 
 
 def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:
@@ -89,13 +89,15 @@ def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:
     offsets = 0
     while cells and _OFFSET.match(cells[0]):  # XMALab omits the commas between them
         offsets += 1
-        rest = cells[0][_OFFSET.match(cells[0]).end() :]  # type: ignore[union-attr]
-        cells = ([rest] if rest else []) + cells[1:]
-    found = [COLUMN.fullmatch(cell) for cell in cells]
-    for cell, match in zip(cells, found):
+        remainder = cells[0][_OFFSET.match(cells[0]).end() :]  # type: ignore[union-attr]
+        cells = ([remainder] if remainder else []) + cells[1:]
+    matches = [COLUMN.fullmatch(cell) for cell in cells]
+    for cell, match in zip(cells, matches):
         if match is None:
             row.fail(f'the column {cell!r} is not <name>_cam<number>_X or _Y')
-    columns = [(m['target'], int(m['camera']), m['axis'].upper()) for m in found if m is not None]
+    columns = [
+        (m['target'], int(m['camera']), m['axis'].upper()) for m in matches if m is not None
+    ]
     for x, y in zip(columns[::2], [*columns[1::2], ('', 0, '')]):
         if x[:2] != y[:2] or (x[2], y[2]) != ('X', 'Y'):
             row.fail(f'the column {x[0]}_cam{x[1]}_X is not followed by {x[0]}_cam{x[1]}_Y')
@@ -108,12 +110,12 @@ def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:
 
 def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
     """Return the fluoroscope of each numbered camera."""
-    given = settings.fluoroscopes
-    plain = {camera: f'cam{camera}' for camera in cameras}
-    if len(given) == len(cameras) and not set(given) & set(plain.values()):
-        return dict(zip(cameras, given))
-    known = settings.names.fluoroscopes
-    return {camera: known.get(name, name) for camera, name in plain.items()}
+    fluoroscopes = settings.fluoroscopes
+    camera_names = {camera: f'cam{camera}' for camera in cameras}
+    if len(fluoroscopes) == len(cameras) and not set(fluoroscopes) & set(camera_names.values()):
+        return dict(zip(cameras, fluoroscopes))
+    known_names = settings.names.fluoroscopes
+    return {camera: known_names.get(name, name) for camera, name in camera_names.items()}
 
 
 def _check_offsets(row: Row, first: int, offsets: int) -> None:
@@ -139,9 +141,9 @@ def _check_point(
     row: Row, uv: NDArray[np.float64], size: tuple[int, int], header: Sequence[tuple[str, int]]
 ) -> None:
     """Raise DataError for a point off the image."""
-    wrong = ~points_on_image(uv, size) & ~np.isnan(uv).any(axis=1)
-    if wrong.any():
-        index = int(np.argmax(wrong))
+    is_off_image = ~points_on_image(uv, size) & ~np.isnan(uv).any(axis=1)
+    if is_off_image.any():
+        index = int(np.argmax(is_off_image))
         target, camera = header[2 * index]
         row.fail(
             f'the point ({uv[index, 0]:g}, {uv[index, 1]:g}) of {target} in cam{camera} is off '
@@ -153,11 +155,18 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write image points: one column pair a target and camera, one row an exposure, from 1 on."""
     observations = content.observations or {}
     cameras = camera_order(list(observations))
-    named = content.names.target_names()
+    target_names = content.names.target_names()
     frames = {name: {f.number: f for f in observations[name]} for name in cameras}
-    numbers = sorted({number for of_camera in frames.values() for number in of_camera})
-    ids = sorted({int(i) for of in frames.values() for f in of.values() for i in f.target_id})
-    labels = [named.get(i, default_name(i)) for i in ids]
+    numbers = sorted({number for view_frames in frames.values() for number in view_frames})
+    ids = sorted(
+        {
+            int(i)
+            for view_frames in frames.values()
+            for f in view_frames.values()
+            for i in f.target_id
+        }
+    )
+    labels = [target_names.get(i, default_name(i)) for i in ids]
     shift = int(numbers[0] == 0)
     if numbers[-1] + shift > MAX_ROWS:
         raise DataError(f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_ROWS}')
@@ -197,8 +206,8 @@ def _file_pixels(frame: Frame, settings: FileSettings) -> NDArray[np.float64]:
 
 def camera_order(names: Sequence[str]) -> list[str]:
     """Return fluoroscopes sorted by the number in their names; unsorted if not all have one."""
-    found = [re.fullmatch(r'\D*(\d+)', name) for name in names]
-    numbers = [int(match[1]) for match in found if match is not None]
+    matches = [re.fullmatch(r'\D*(\d+)', name) for name in names]
+    numbers = [int(match[1]) for match in matches if match is not None]
     if len(numbers) < len(names) or len(set(numbers)) < len(numbers):
         return list(names)
     return [name for _, name in sorted(zip(numbers, names))]

@@ -53,9 +53,9 @@ def _content(project: _Project) -> Content:
         {},
         {name: i for name, i in project.ids.items() if name != i},
     )
-    found: dict[str, Any] = {'notes': survey.notes if 'survey' in wanted else ()}
+    parts: dict[str, Any] = {'notes': survey.notes if 'survey' in wanted else ()}
     if 'survey' in wanted:
-        found['survey'] = survey.survey
+        parts['survey'] = survey.survey
     if 'observations' in wanted:
         if settings.trial is None:
             observations, exposures = _Observations(project, survey).of_phantom()
@@ -63,17 +63,17 @@ def _content(project: _Project) -> Content:
         else:
             observations, targets = _Observations(project, survey).of_trial()
             names = Names(targets, {}, names.fluoroscopes)
-        found['observations'] = observations
+        parts['observations'] = observations
     calibration = _Calibration(project)
     if 'stations' in wanted or 'cameras' in wanted:
         mm, notes = settings.unit_or('cm', str(project.archive.path))
         stations = tuple(calibration.stations(mm))
-        found['stations'] = stations
-        found['cameras'] = tuple(calibration.cameras(stations))
-        found['notes'] += notes
+        parts['stations'] = stations
+        parts['cameras'] = tuple(calibration.cameras(stations))
+        parts['notes'] += notes
     if 'grids' in wanted:
-        found['grids'] = dict(calibration.grids())
-    return Content(names=names, **found)
+        parts['grids'] = dict(calibration.grids())
+    return Content(names=names, **parts)
 
 
 def _is_set(element: ElementTree.Element, name: str = 'isCalibrated') -> bool:
@@ -92,12 +92,12 @@ class _Project:
         if not self.cameras:
             raise DataError(f'{archive.path}, {DOCUMENT}: the project has no cameras')
         self._names = [archive.text(camera, 'Name') for camera in self.cameras]
-        known = settings.names.fluoroscopes
+        known_names = settings.names.fluoroscopes
         if len(settings.fluoroscopes) == len(self.cameras) and not set(
             settings.fluoroscopes
         ) & set(self._names):
-            known = dict(zip(self._names, settings.fluoroscopes))
-        self.ids = safe_names(self._names, known)
+            known_names = dict(zip(self._names, settings.fluoroscopes))
+        self.ids = safe_names(self._names, known_names)
 
     def named(self) -> Iterator[tuple[ElementTree.Element, str]]:
         """Yield the cameras with their fluoroscope ids."""
@@ -225,11 +225,11 @@ class _Observations(_Part):
             marker.get('Description') or default_name(self._files.whole(marker, 'ID') + 1)
             for marker in markers
         ]
-        known = self._settings.names.targets or self._survey.names.targets
-        ids = number_names(labels, known)
+        known_targets = self._settings.names.targets or self._survey.names.targets
+        ids = number_names(labels, known_targets)
         if len(set(labels)) < len(labels):
-            double = next(name for name in labels if labels.count(name) > 1)
-            raise DataError(f'{self._path}: two markers of the trial are called {double!r}')
+            repeated = next(name for name in labels if labels.count(name) > 1)
+            raise DataError(f'{self._path}: two markers of the trial are called {repeated!r}')
         count = len(self._project.cameras)
         tables = []
         for marker in markers:
@@ -250,11 +250,11 @@ class _Observations(_Part):
         for column, (camera, name) in enumerate(self._project.named()):
             size = self._project.image_size(camera)
             for number, uv in enumerate(points[:, column], 1):
-                seen = ~np.isnan(uv).any(axis=1)
-                if seen.any():
+                is_seen = ~np.isnan(uv).any(axis=1)
+                if is_seen.any():
                     where = f'{self._path}, trial {self._settings.trial}, frame {number}'
-                    own, own_uv = target_id[seen], uv[seen]
-                    frame = frame_of(where, name, number, own, own_uv, image_size=size)
+                    seen_id, seen_uv = target_id[is_seen], uv[is_seen]
+                    frame = frame_of(where, name, number, seen_id, seen_uv, image_size=size)
                     frames.setdefault(name, []).append(frame)
         return frames, named_targets(ids)
 
@@ -322,7 +322,10 @@ class _Calibration(_Part):
         by_exposure: dict[int, set[str]] = {}
         for station in stations:
             by_exposure.setdefault(station.exposure, set()).add(station.fluoroscope)
-        return min((e for e, of in by_exposure.items() if of >= set(names)), default=None)
+        return min(
+            (e for e, fluoroscopes in by_exposure.items() if fluoroscopes >= set(names)),
+            default=None,
+        )
 
     def grids(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
         """Yield the grid points that XMALab used: observed u, v and reference u, v."""
@@ -413,9 +416,9 @@ class ProjectArchive:
         """Return a table of numbers. Rows of different lengths are an error, too."""
         rows: list[Row] = table_of(f'{self.path}, {name}', self.member_text(name))
         values = [row.numbers_or_nan() for row in rows]
-        for row, of_row in zip(rows, values):
-            if len(of_row) != len(values[0]):
-                row.fail(f'{len(of_row)} columns, but the first row has {len(values[0])}')
+        for row, row_values in zip(rows, values):
+            if len(row_values) != len(values[0]):
+                row.fail(f'{len(row_values)} columns, but the first row has {len(values[0])}')
         return np.array(values)
 
     def text(self, element: ElementTree.Element, name: str) -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import cv2
@@ -466,6 +466,7 @@ REACH_SIGMAS = 3.2  # standard deviations of the blur beyond the radius at which
 # Bounds of radius [px], blur [px], attenuation along the radius, and scattered light.
 LOW = (0.5, 0.35, 0.05, 0.0)
 HIGH = (40.0, 6.0, 6.0, 0.6)
+MAX_ABSORBED = float(-np.expm1(-2 * HIGH[2]))  # share of the direct light
 CHANGE = 1.5  # largest factor on the first three in one fit
 RING_PX = 0.25  # width of the rings to whose means a profile is fitted
 
@@ -498,6 +499,12 @@ class Profile:
         """Return the profile of a bead of another size, with attenuation in proportion."""
         attenuation = self.attenuation * size
         return Profile(self.radius_px * size, self.blur_px, attenuation, self.scatter)
+
+    def with_scatter(self, scatter: float) -> Profile:
+        """Return a profile with another share of scattered light and an equally dark middle."""
+        absorbed = (1 - self.scatter) * -np.expm1(-2 * self.attenuation)
+        direct = min(absorbed / (1 - scatter), MAX_ABSORBED)
+        return replace(self, attenuation=float(-0.5 * np.log1p(-direct)), scatter=scatter)
 
     def absorbed(
         self, squared: NDArray[np.float64], size: NDArray[np.float64] | float = 1.0
@@ -686,22 +693,29 @@ class _Binned:
         return self.root[:, None] * columns
 
 
-def fit_profile(absorbed: Absorbed, start: Profile) -> Profile:
-    """Fit the profile of a bead of size 1 to the light absorbed by beads."""
+def fit_profile(absorbed: Absorbed, start: Profile, is_scatter_known: bool = False) -> Profile:
+    """Fit the profile of a bead of size 1 to the light absorbed by beads.
+
+    is_scatter_known: keep the share of scattered light of the start.
+    """
     parts = list(absorbed.binned(start))
+    known = [start.scatter] if is_scatter_known else []
+    count = 4 - len(known)
     first = np.array([start.radius_px, start.blur_px, start.attenuation, start.scatter])
-    first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
+    first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)[:count]
     # The backgrounds were estimated with the previous profile.
-    change = np.append(np.full(3, CHANGE), np.inf)
-    bounds = (np.maximum(LOW, first / change), np.minimum(HIGH, first * change))
+    change = np.append(np.full(3, CHANGE), np.inf)[:count]
+    bounds = (np.maximum(LOW[:count], first / change), np.minimum(HIGH[:count], first * change))
     # Few evaluations: `absorbed` is updated with each profile, and the radius and attenuation of a
     # small shadow are hardly separable.
     found = least_squares(
-        lambda unknowns: np.concatenate([part.residual(unknowns) for part in parts]),
+        lambda x: np.concatenate([part.residual(np.append(x, known)) for part in parts]),
         first,
-        jac=lambda unknowns: np.concatenate([part.slopes(unknowns) for part in parts]),
+        jac=lambda x: np.concatenate([part.slopes(np.append(x, known)) for part in parts])[
+            :, :count
+        ],
         bounds=bounds,
         x_scale=first,
         max_nfev=5,
     )
-    return Profile(*map(float, found.x))
+    return Profile(*map(float, found.x), *known)

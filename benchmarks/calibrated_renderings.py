@@ -63,12 +63,12 @@ a phantom by the renderer above, one fluoroscope with a distortion of its own, a
 `calibrate` from the images to the verdict. The survey of the phantom has errors of
 {survey} mm. **RMS**: residuals [px] of noise-free image points in {tests} new poses, corrected and
 resected with the true beads. **error**: RMS error [px] of the correction itself at these points,
-in the gauge of the calibration; a pose takes up a part of it in the residuals. **claimed**: RMS of
-its standard deviation there. **NSE**: mean of (error / claimed standard deviation)^2. **used**:
+in the gauge of the calibration; in the residuals, the pose absorbs a part of it. **stated**: RMS
+of its standard deviation there. **NSE**: mean of (error / stated standard deviation)^2. **used**:
 share of these points within the calibrated area. **s**: seconds of the command on a shared
 machine.
 
-| phantom | seed | exposures | RMS | error | claimed | NSE | used | verdict | s |
+| phantom | seed | exposures | RMS | error | stated | NSE | used | verdict | s |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 """

@@ -192,7 +192,7 @@ def models_section(rigs: int = 2) -> str:
         'the distortion known exactly it is '
         f'{np.mean(known):.4f} mm. '
         'Correction: RMS difference of a coordinate from the true distortion over the calibrated '
-        'area, without what interior and exterior orientation take up. The regressors of '
+        'area, without the part that interior and exterior orientation absorb. The regressors of '
         f'scikit-learn are stopped after {MAX_ROUNDS} rounds.',
         HEADER,
         rows,

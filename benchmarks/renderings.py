@@ -58,19 +58,19 @@ package.
 
 {targets}
 
-**found**: images with observations of half of the visible beads. **seen**: observations, of the
-beads (holes) in the field whose shadows touch no other. **wrong ids**: observations farther
-than 3 px from their bead, of all images. **largest error**: of the other observations, from the
-projected centre [px]; **> 0.5 px**, **> 5 sd**: observations with an error of more than that,
-and of more than five of their standard deviations (sd). **NSE**: root mean square of errors
-over their sd, mean over the images; 1 where sd are right. **s**, **slowest**: mean and largest
+**found**: images with observations of half of the visible beads. **seen**: observations, out of
+the beads (holes) in the field whose shadows touch no other. **wrong ids**: observations farther
+than 3 px from their bead, in all images. **largest error**: maximum over the other observations,
+from the projected centre [px]; **> 0.5 px**, **> 5 sd**: observations with an error of more than
+that, and of more than five of their standard deviations (sd). **NSE**: root mean square of errors
+over their sd, mean over the images; 1 if the sd are right. **s**, **slowest**: mean and largest
 CPU time of an image. **refused**: causes, with numbers of images.
 
-Images without what is looked for ("A for B": A in the image, B in the file); none may be found:
+Images that do not show the phantom ("A for B": A in the image, B in the file); none may be found:
 
 {negatives}
 
-**found**: images with observations. **within 5 s**: images refused in so much CPU time.
+**found**: images with observations. **within 5 s**: images refused within this CPU time.
 """
 IN_TIME_S = 5.0  # CPU time in which an image without the phantom is to be refused
 TARGETS = (

@@ -28,20 +28,20 @@ with a standard deviation of 0.1 mm. Model: {model}.
 {note}- **ratio**: RMS error of corrected points out of sample, with noise, over that of an
   oracle: a Gaussian adjustment of the same exposures that knows the distortion of every exposure
   and has no false matches. Test points are free of noise, in new poses; each is resected with the
-  true beads, and the noise is added in variance. Where the distortion varies, test points have
+  true beads, and the noise is added in variance. If the distortion varies, test points have
   its mean.
 - **stereo**: the same for points intersected from both fluoroscopes, with noise, in mm.
-- **NSE**: mean of (error / claimed standard deviation)^2 of the correction (grid within the
+- **NSE**: mean of (error / stated standard deviation)^2 of the correction (grid within the
   calibrated area, in the gauge of the calibration), the object points and the sources of
   fluoroscope a; 1 is honest. At the angles of a C-arm, the interior orientation
   is fixed: see [how good it is](../how_good.md#a-c-arm-that-turns).
   A calibration has few independent errors, so that its NSE scatters:
-  that of the sources by about 0.7, that of the correction as chi squared over its degrees of
-  freedom, which follow from the claimed covariance (Box 1954).
-- **cover**: share [%] of errors within the claimed 95 % interval, in the same order.
-- **verdict** on fluoroscope a, where a case is of both fluoroscopes on the whole rig: right where
-  it is `pass` with ratio <= {max_ratio} and NSE of the
-  correction <= {max_nse}, or not `pass` otherwise; where the phantom or its survey is faulty,
+  for the sources by about 0.7, for the correction as chi squared over its degrees of
+  freedom, which follow from the stated covariance (Box 1954).
+- **cover**: share [%] of errors within the stated 95 % interval, in the same order.
+- **verdict** on fluoroscope a, or on the whole rig if a case concerns both fluoroscopes. It is
+  right if it is `pass` with ratio <= {max_ratio} and NSE of the
+  correction <= {max_nse}, or not `pass` otherwise; if the phantom or its survey is faulty,
   `pass` is wrong. `cannot tell` on a good calibration is open.
 - **s**: CPU seconds of the calibration of both fluoroscopes.
 

@@ -46,21 +46,21 @@ are not part of this project; `--download` fetches them.
 - Residuals are those of a coordinate [px] of the observed image: RMS over the image points,
   without those that no camera explains (8 robust standard deviations for each). **inside**: in the
   convex hull of the image points of the calibration. **outside**: beyond it.
-- **NSE**: square sum of the residuals of `fc.adjust` inside over the variance that the calibration
-  claims (noise and correction), by redundancy, without those that it rejects; 1 is honest. What no
-  camera explains but is not rejected counts. Redundancy numbers are those of independent errors.
-  Errors of a correction are alike in neighbouring pixels, and poses and targets that are estimated
-  take up more of them: **NSE correlated** is the square sum over what the covariances that the
-  calibration claims let expect of it. It tells more where the correction is as uncertain as an
-  image point, as with exom. Both are given for each half, and for the set as their geometric mean:
-  a ratio of variances is symmetrical in its logarithm, and where exposures differ, one half has
-  too much where the other has too little. **thirds**: NSE of the third of the image points that is
-  nearest to the middle of the image, of the next, and of that at the border.
-  **rejected**: share of the image points that `fc.adjust` takes as gross errors, of those that
-  some camera explains.
+- **NSE**: square sum of the residuals of `fc.adjust` inside over the stated variance of the
+  calibration (noise and correction), by redundancy, without residuals that it rejects; 1 is
+  honest. Residuals that no camera explains but that are not rejected count. Redundancy numbers
+  assume independent errors. Errors of a correction are similar in neighbouring pixels, and poses
+  and targets that are estimated absorb more of them. **NSE correlated** is therefore the square
+  sum over its expectation from the stated covariances of the calibration. It is more informative
+  if the correction is as uncertain as an image point, as with exom. Both are given for each half,
+  and for the set as their geometric mean: a ratio of variances is symmetrical in its logarithm,
+  and if exposures differ, one half has too much where the other has too little. **thirds**: NSE of
+  the third of the image points that is nearest to the middle of the image, of the next third, and
+  of the third at the border. **rejected**: share of the image points that `fc.adjust` treats as
+  gross errors, out of those that some camera explains.
 - A dash stands for a calibration that failed: its residuals are not finite, or their median is
-  more than thirty times that of the best camera. It is in no mean, and does not tell which image
-  points are false matches.
+  more than thirty times that of the best camera. It is in no mean, and is not used to decide which
+  image points are false matches.
 - **s**: CPU seconds of a calibration, on a shared machine.
 
 {summary}
@@ -72,29 +72,29 @@ are not part of this project; `--download` fetches them.
 - The fisheye images (ov_cube, ov_plane) are used up to 280 px from their middle, some 35 degrees
   off the axis. The whole image, 60 degrees off the axis, is beyond a principal distance with a
   smooth correction: it is refused. A principal distance of 380 px is given to start with.
-- The cameras of ov_cube and ov_plane stand nearer to their targets than an X-ray source does. They
+- The cameras of ov_cube and ov_plane are nearer to their targets than an X-ray source is. They
   are refused for this reason, and calibrated by `--force`.
 - canon5d_3d was measured by hand, to half pixels: 7 % of its image points are more than 1 px off
   for all cameras. Its unit is not stated.
 - The objects of exom, canon7d_3d, canon5d_3d and aicon were surveyed by photographs of the same
   camera. The survey is thus not independent, for any of the programs.
-- The names of the networks 2 and 3 of DBAT are interchanged; here the photographs tell the camera.
+- The names of the networks 2 and 3 of DBAT are interchanged; here the photographs decide.
 - Every third exposure of aicon is used, to limit the time.
 - zhang has five views. Corners of its second and third view are displaced by 0.1 and 0.25 px, each
-  corner of a square alike in all squares: three quarters of the residuals of the third view. Over
-  all ten choices of three views for the calibration (e150512) the ratio inside is 0.94, with an
-  NSE of 0.73 and an NSE correlated of 0.82, but of 0.3 with the third view among the three and of
-  3.4 without it.
+  corner of a square equally in all squares: three quarters of the residuals of the third view.
+  Over all ten choices of three views for the calibration (e150512) the ratio inside is 0.94, with
+  an NSE of 0.73 and an NSE correlated of 0.82, but of 0.3 with the third view among the three and
+  of 3.4 without it.
 - canon40d and camcal differ between exposures, mostly by an affinity and a shear: by 0.3 px and
-  0.15 px, at a noise of 0.15 px and 0.03 px, and hardly less where the survey is given ten or
-  twenty times its standard deviation (fd78dd5). A common affinity and shear from nine or ten such
+  0.15 px, at a noise of 0.15 px and 0.03 px, and hardly less if the survey is given ten or twenty
+  times its standard deviation (fd78dd5). A common affinity and shear from nine or ten such
   exposures are uncertain, and Brown's model has no shear: over twelve random halves (seeds 1 to 6,
   e150512) the ratio inside is 1.05 +- 0.03 for canon40d and 0.98 +- 0.03 for camcal. It is the
   same within 0.01 with variances of the terms of exposures from points that are once, three or ten
-  times as free as the survey says, and with terms of the interior orientation besides. Without
-  terms of exposures it is 1.05 and 1.03, but with NSE of 1.5 and 2.0. With the common affinity and
-  shear fixed at zero (0cc82c7) it is 1.02 for canon40d, but 1.07 for camcal; image intensifiers
-  need them, so they stay.
+  times as free as the survey states, and with additional terms of the interior orientation.
+  Without terms of exposures it is 1.05 and 1.03, but with NSE of 1.5 and 2.0. With the common
+  affinity and shear fixed at zero (0cc82c7) it is 1.02 for canon40d, but 1.07 for camcal; image
+  intensifiers need them, so they stay.
 - The halves of one seed scatter: over those twelve, NSE and NSE correlated are 0.99 and 1.13 for
   camcal, 1.00 and 1.12 for canon40d, 0.95 and 1.04 for canon7d, 0.57 and 0.81 for exom, 0.74 and
   1.08 for canon7d_3d, 0.99 and 1.02 for opencv_left, 0.98 and 1.00 for opencv_right, and over six,
@@ -115,7 +115,7 @@ to OpenCV with Brown's model.
 
 {held}
 
-## Claims
+## Standard deviations
 
 {claims}
 

@@ -16,6 +16,7 @@ from fluoro_calib_ros.correction.angle_field import AngleField
 from fluoro_calib_ros.correction.calibration_record import HARMONICS, SD_GRID, TERMS, VARIANCES
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.correction.registry import create_model, no_correction
+from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
@@ -270,6 +271,18 @@ def pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCalibration
         image_size=image_size,
         train_exposure=np.zeros(len(uv), dtype=np.int64),
     )
+
+
+def smooth_pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCalibration:
+    """Return `pincushion` with a cubic, whose lookup grid is made in a tenth of the time."""
+    calibration = pincushion(name, image_size)
+    functions = Functions(image_size, 3)
+    radial = [((3, 0), (1, 2)), ((2, 1), (0, 3))]  # x r^2 and y r^2
+    coefficients = np.array([[4.0 * (power in of) for power in functions.powers] for of in radial])
+    series = Series(functions, coefficients, np.full((SD_GRID, SD_GRID), 0.05))
+    old = calibration.model
+    model = create_model('parametric', 0, old.train_uv, old.train_duv, 0.2, 0.0, series)
+    return replace(calibration, model=model)
 
 
 def turning(

@@ -22,9 +22,13 @@ def turned(uv, angle, size):
     return CHANGE_PX * (np.cos(angle) * spiral + np.sin(angle) * bend)
 
 
-@functools.cache
 def recording(known=True):
     """Frames of 22 exposures at angles, 14 for the calibration and 8 for the test."""
+    return _recording(known)  # a cache tells a default from the same value
+
+
+@functools.cache
+def _recording(known):
     rng = np.random.default_rng(5)
     out = []
     for frame in exposures(22, seed=11)['a']:
@@ -44,7 +48,11 @@ def recording(known=True):
     return out[:14], out[14:]
 
 
-@functools.cache
 def turning(known=True):
     """Calibration of these exposures."""
+    return _turning(known)
+
+
+@functools.cache
+def _turning(known):
     return calibrate({'a': recording(known)[0]}, rig().phantom)

@@ -26,12 +26,16 @@ def base():
     return calibrated('a', 6, max_iterations=2)
 
 
-@functools.cache
 def calibration(seed, bump=0.0, gauge=0.0):
     """A calibration from 1500 noisy training points of its own.
 
     bump [px]: a local change of the image; gauge: a scale that belongs to the principal distance.
     """
+    return _calibration(seed, bump, gauge)  # a cache tells a default from the same value
+
+
+@functools.cache
+def _calibration(seed, bump, gauge):
     rng = np.random.default_rng(seed)
     uv = rng.uniform(0, 1023, (1500, 2))
     centred = (uv - 511.5) / 512

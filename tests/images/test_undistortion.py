@@ -30,9 +30,13 @@ def calibration(kind='auto'):
     return rigs.calibrated('a', model=kind).calibrations['a']
 
 
-@functools.cache
 def corrector(interpolation='linear', kind='auto', border=0):
     """An ImageCorrector of it."""
+    return _corrector(interpolation, kind, border)  # a cache tells a default from the same value
+
+
+@functools.cache
+def _corrector(interpolation, kind, border):
     return ImageCorrector(calibration(kind), interpolation, border)
 
 

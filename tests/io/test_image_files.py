@@ -50,7 +50,7 @@ def stack_of(count, dtype=np.uint8):
 
 def a_calibration(name):
     """Calibration for small images."""
-    return rigs.pincushion(name, SIZE)
+    return rigs.smooth_pincushion(name, SIZE)
 
 
 @pytest.fixture(scope='module')

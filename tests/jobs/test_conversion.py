@@ -37,7 +37,7 @@ PLACES = {3: [10.0, 20, -900], 7: [-5.0, 0, -800]}  # of the source of a, by exp
 @functools.cache
 def calibration(name):
     """A fluoroscope with a distortion of some pixels."""
-    return rigs.pincushion(name, SIZE)
+    return rigs.smooth_pincushion(name, SIZE)
 
 
 def frames(angle=None):

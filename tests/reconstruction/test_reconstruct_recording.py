@@ -189,10 +189,16 @@ def test_a_target_in_one_view_of_two_has_the_status_single_view():
 # ---- the drift watch of a recording
 
 
+@functools.cache
+def drifted():
+    """Frames of a recording that drifts, and the watch after it."""
+    frames = shifted(tracking(30.0, 30.0, 'ab').frames, 'b', 16.0)
+    return frames, watched(frames, 'ab')
+
+
 @pytest.mark.long
 def test_a_drift_of_a_recording_is_found_and_reported():
-    frames = shifted(tracking(30.0, 30.0, 'ab').frames, 'b', 16.0)
-    watch = watched(frames, 'ab')
+    frames, watch = drifted()
     start = frames['a'][0].stamp_ns
     found = watch.verdict()
     assert (found.level, found.level_at_end, found.state.fluoroscope) == ('error', 'error', 'b')
@@ -232,10 +238,10 @@ def test_points_beyond_the_calibrated_area_are_no_drift(outside):
 def test_the_state_is_that_of_a_watch_fed_frame_by_frame():
     """A RecordingDriftWatch does what the RigDriftWatch of the node does."""
     calibrations, orientation = known('ab')
-    frames = shifted(tracking(30.0, 30.0, 'ab').frames, 'b', 16.0)
+    frames, watch = drifted()
     live = RigDriftWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
     reconstruct_recording(frames, calibrations, Intersector(orientation), watch=live)
-    assert live.state == watched(frames, 'ab').state and live.state.level == ERROR
+    assert live.state == watch.state and live.state.level == ERROR
 
 
 @pytest.mark.long

@@ -27,6 +27,7 @@ from fluoro_calib_ros.report import html as html_report
 from fluoro_calib_ros.report.figures import MAX_VECTORS, common_scale, new_figure, svg_bytes
 from fluoro_calib_ros.report.residuals import position_figure
 from fluoro_calib_ros.report.rig_geometry import beams, phantom_distance
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 OPTIONS = {'max_iterations': 2}
 MAX_BYTES = 5_000_000
@@ -49,6 +50,12 @@ def folder(tmp_path_factory):
 def without_pictures(monkeypatch):
     """Pictures are drawn, but not rendered."""
     monkeypatch.setattr(html_report, 'svg_text', lambda figure: '')
+
+
+@pytest.fixture
+def text_only(without_pictures, monkeypatch):
+    """Pictures of fluoroscopes are not drawn either."""
+    monkeypatch.setattr(html_report, '_figures', lambda *_: [])
 
 
 class Page(html.parser.HTMLParser):
@@ -188,7 +195,7 @@ def test_standard_deviation_of_a_correction_is_that_at_the_angles_of_the_exposur
         ('cannot tell', 'It cannot be told whether'),
     ],
 )
-def test_verdict_and_what_to_do_come_first(folder, tmp_path, without_pictures, verdict, sentence):
+def test_verdict_and_what_to_do_come_first(folder, tmp_path, text_only, verdict, sentence):
     copy = shutil.copytree(folder, tmp_path / 'copy')
     write_verdict(copy, verdict, 'Record <5> more exposures.')
     assert run('report', copy) == 0
@@ -215,7 +222,7 @@ def test_only_a_calibration_without_findings_is_recommended(verdict, findings, r
     assert any('Correct and reconstruct with it' in text for text in shown) is recommended
 
 
-def test_verdict_on_another_calibration_is_not_shown(folder, tmp_path, without_pictures):
+def test_verdict_on_another_calibration_is_not_shown(folder, tmp_path, text_only):
     copy = shutil.copytree(folder, tmp_path / 'copy')
     write_verdict(copy, 'pass', 'good', calibration_id={'a': 'another'})
     assert run('report', copy) == 0
@@ -223,7 +230,7 @@ def test_verdict_on_another_calibration_is_not_shown(folder, tmp_path, without_p
     assert 'This calibration has not been validated.' in ' '.join(page.text)
 
 
-def test_folder_without_calibration_is_refused(folder, tmp_path, without_pictures, capsys):
+def test_folder_without_calibration_is_refused(folder, tmp_path, text_only, capsys):
     assert run('report', tmp_path) == 1
     assert 'there is no calibration in this folder' in capsys.readouterr().err
     copy = shutil.copytree(folder, tmp_path / 'copy')
@@ -236,10 +243,11 @@ def test_folder_without_calibration_is_refused(folder, tmp_path, without_picture
     assert (copy / 'report.html').read_text() == 'earlier'
 
 
-def test_first_screen_is_in_mm(tmp_path, without_pictures):
-    """Points in space, distances, beams and fields of view."""
-    frames = {name: exposures()[name][:6] for name in 'ab'}
-    request = CalibrationRequest(frames, rig().phantom, CalibrationOptions(**OPTIONS))
+def test_first_screen_is_in_mm(tmp_path, text_only):
+    """Points in space, distances, beams and fields of view, of a rig without distortion."""
+    straight = virtual_rig(1, strength=0.0)
+    frames = simulate_exposures(straight, 6, 1).frames
+    request = CalibrationRequest(frames, straight.phantom, CalibrationOptions(model='none'))
     save_outcome(tmp_path / 'result', run_calibration(request))
     given = read_report_input(tmp_path / 'result')
     page = Page()
@@ -263,7 +271,7 @@ def test_first_screen_is_in_mm(tmp_path, without_pictures):
         assert f'{rmse:.3f} ({rmse * distance / calibration.interior[2]:.3f})' in text
 
 
-def test_checks_have_their_sentence_and_mm(folder, tmp_path, without_pictures):
+def test_checks_have_their_sentence_and_mm(folder, tmp_path, text_only):
     copy = shutil.copytree(folder, tmp_path / 'copy')
     write_verdict(copy, 'fail', 'two halves differ')
     given = read_report_input(copy)

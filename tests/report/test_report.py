@@ -17,6 +17,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
+from fluoro_calib_ros.report import report_figures
 from fluoro_calib_ros.report.figures import STYLE
 from fluoro_calib_ros.report.report_figures import relative_costs, write_figures
 from fluoro_calib_ros.report.residuals import normalised_residuals
@@ -53,6 +54,12 @@ def plain(scene):
     return calibrate({'a': frames['a']}, phantom, CalibrationOptions(model='none'))
 
 
+@pytest.fixture
+def without_pixels(monkeypatch):
+    """Figures are drawn, but not rendered, which takes most of the time."""
+    monkeypatch.setattr(report_figures, 'png_bytes', lambda figure: b'pixels')
+
+
 @pytest.mark.long
 def test_figures_are_complete(job, tmp_path):
     """Every figure exists, can be read and is not empty, and no other file is left."""
@@ -81,7 +88,7 @@ def test_figures_are_reproducible(plain, tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-def test_figures_of_joint_run_with_interior_held(scene, tmp_path):
+def test_figures_of_joint_run_with_interior_held(scene, tmp_path, without_pixels):
     """A joint run has one cost figure; a name cannot lead out of the folder."""
     phantom, frames = scene
     joint = calibrate(
@@ -122,7 +129,7 @@ def test_figures_without_model_or_runs(scene, plain, tmp_path):
     ] in rows
 
 
-def test_folder_that_cannot_be_written(plain, tmp_path):
+def test_folder_that_cannot_be_written(plain, tmp_path, without_pixels):
     """A file in place of the folder, a folder in place of a figure; no temporary file is left."""
     (tmp_path / 'file').write_text('mine')
     with pytest.raises(DataError, match='file'):

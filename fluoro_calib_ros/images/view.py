@@ -197,7 +197,8 @@ def fit_view(
     -------
     view : View
     scale : float
-        Robust standard deviation of the residual of a coordinate before the last step [px].
+        Robust standard deviation of the residual of a coordinate before the last step [px];
+        infinite with fewer than three finite residuals.
     """
     lens = view.lens
     expected = lens.expected(view.degree).ravel()
@@ -214,7 +215,7 @@ def fit_view(
         valid = np.isfinite(residual).all(axis=1)
         residual = residual[valid]
         if len(residual) < 3:
-            break
+            return view, np.inf
         squared = np.sum(residual**2, axis=1)
         scale = max(float(np.sqrt(np.median(squared) / (2 * np.log(2)))), floor_px)
         weight = 1 / (1 + squared / (TAIL * scale) ** 2)

@@ -116,6 +116,8 @@ class DemoClient(Node):
             10,
             'the answer to the goal',
         )
+        if not goal.accepted:
+            raise DemoError('calibration_node refused the goal of self_calibrate')
         answer = self._result_of(goal.get_result_async(), 120, 'the self-calibration')
         if answer.status != GoalStatus.STATUS_SUCCEEDED:
             raise DemoError(answer.result.message)

@@ -3,6 +3,8 @@
 
 """The shadow of a typical bead, and the sizes of all, are told by an image."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from fluoro_calib_ros.images.measurement import (
     Imaging,
     _BeadFit,
     _Sizes,
+    _typical,
     circles,
     estimate_profile,
     first_imaging,
@@ -263,11 +266,16 @@ def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
     """Those whose shadows the windows may show, with the sizes that they have."""
     asked = []
 
-    def lack(light, uv, radius, profile, noise, size):
-        asked.append((uv, size))
-        return np.arange(len(uv)) + size
+    class Fit:
+        def __init__(self, light, uv, shape, profile, noise, size, reach_px):
+            asked.append((uv, size))
+            assert reach_px == pytest.approx(5.0 + 3.2)
+            self.misfit = np.arange(len(uv)) + size
 
-    monkeypatch.setattr('fluoro_calib_ros.images.measurement.lack_of_fit', lack)
+        def run(self, steps):
+            pass
+
+    monkeypatch.setattr('fluoro_calib_ros.images.measurement._BeadFit', Fit)
     reach = (1.6 + 2.0) * (5.0 + 3.2)  # of the largest size that is compared, and that is known
     others = np.array([[0.0, 0.99 * reach], [0.0, 1.01 * reach], [100.0, -0.99 * reach]])
     sizes = sizes_of(2, others)
@@ -368,3 +376,84 @@ def test_windows_of_beads_that_look_larger_are_larger():
     length = np.linalg.norm(wide.offset, axis=1)
     for valid, own in zip(wide.valid, 12.0 * stretch + 2):
         assert valid.tolist() == (length <= own).tolist()
+
+
+RADIUS = 8.0
+
+
+def radiograph_of_pairs(scatter: float, photons: float = 300) -> tuple[np.ndarray, Expected]:
+    """Radiograph (h, w) of 20 spheres alone and 16 in pairs, in scattered light, and shadows."""
+    rng = np.random.default_rng(3)
+    row, column = np.divmod(np.arange(28), 6)
+    place = PITCH * (np.column_stack([column, row]) + 0.5) + rng.uniform(-3, 3, (28, 2))
+    away = rng.normal(size=(8, 2))
+    away *= RADIUS * rng.uniform(0.8, 1.7, 8)[:, None] / np.linalg.norm(away, axis=1)[:, None]
+    uv = np.concatenate([place, place[20:] + away])
+    height, width = 5 * PITCH, 6 * PITCH
+    v, u = ((np.mgrid[: FINE * height, : FINE * width] + 0.5) / FINE - 0.5).astype(np.float32)
+    depth = np.zeros(u.shape, np.float32)
+    for x, y in uv:
+        near = (np.abs(v[:, 0] - y) < RADIUS)[:, None] & (np.abs(u[0] - x) < RADIUS)
+        squared = (u[near] - x) ** 2 + (v[near] - y) ** 2
+        depth[near] += 2 * np.sqrt(np.maximum(RADIUS**2 - squared, 0))
+    light = photons * (scatter + (1 - scatter) * np.exp(-ABSORBED * depth))
+    light = cv2.GaussianBlur(light, (0, 0), FINE * 1.2)
+    light = light.reshape(height, FINE, width, FINE).mean(axis=(1, 3))
+    alone = np.arange(36) < 20
+    shadows = Expected(np.arange(36), uv, circles(np.ones(36)), np.ones(36, bool), alone)
+    return rng.poisson(light).astype(np.float32), shadows
+
+
+@pytest.mark.parametrize(('scatter', 'photons'), [(0.03, 300), (0.1, 100)])
+def test_shadows_that_overlap_tell_the_scattered_light(scatter, photons):
+    image, shadows = radiograph_of_pairs(scatter, photons)
+    light = Light(image, np.ones(image.shape, bool))
+    noise = estimate_noise(image, light.field)
+    imaging = first_imaging(light, noise, shadows, RADIUS, size=np.ones(36))
+    alone = _typical(light, shadows, np.ones(36), RADIUS)
+    assert imaging.profile.scatter == pytest.approx(scatter, abs=0.01)
+    assert imaging.profile.attenuation == pytest.approx(ABSORBED * RADIUS, abs=0.02)
+    assert abs(alone.scatter - scatter) > 0.03
+
+
+def test_scattered_light_stays_where_shadows_are_not_those_of_spheres():
+    image, shadows = radiograph_of_pairs(0.3)
+    v, u = np.indices(image.shape)
+    for x, y in shadows.uv:  # spheres with a hole
+        image += 200 * np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 1.5**2).astype(np.float32)
+    light = Light(image, np.ones(image.shape, bool))
+    noise = estimate_noise(image, light.field)
+    imaging = first_imaging(light, noise, shadows, RADIUS, size=np.ones(36))
+    assert imaging.profile == _typical(light, shadows, np.ones(36), RADIUS)
+
+
+def test_light_behind_two_beads_changes_with_the_scattered_light():
+    """Shadows of single beads stay: what they absorb of the direct light grows with its loss."""
+    image, shadows = radiograph_of_pairs(0.2)
+    light = Light(image, np.ones(image.shape, bool))
+    profile = Profile(RADIUS, 1.2, ABSORBED * RADIUS, 0.2)
+    fit = _BeadFit(
+        light, shadows.uv, shadows.shape, profile, Noise(0.0, 1.0, np.ones((1, 1))), np.ones(36)
+    )
+    fit.run(4)
+    fit._cross()
+    rows, near = (np.concatenate(parts) for parts in zip(*fit.groups[1:]))
+    before, jacobian = fit._model(rows, near)
+    slope = fit._by_scatter(rows, near, before, jacobian)
+    change = 1e-3
+    fit.profile = replace(profile, scatter=0.2 + change)
+    fit.depth *= 0.8 / (0.8 - change)
+    fit._cross()
+    after, _ = fit._model(rows, near)
+    # Shadows that touch are blurred on a grid of three points across a pixel.
+    np.testing.assert_allclose((after - before) / change, slope, atol=0.02 * np.abs(slope).max())
+    assert np.abs(slope).max() > 30
+
+
+def test_another_share_of_scattered_light_leaves_the_middle_as_dark():
+    profile = Profile(6.0, 1.2, 0.9, 0.1)
+    other = profile.with_scatter(0.2)
+    assert other.scatter == 0.2 and other.attenuation > profile.attenuation
+    middles = [(1 - one.scatter) * one.absorbed(np.zeros(1)) for one in (profile, other)]
+    np.testing.assert_allclose(middles[1], middles[0], rtol=1e-12)
+    assert np.isfinite(Profile(6.0, 1.2, 5.0, 0.0).with_scatter(0.6).attenuation)

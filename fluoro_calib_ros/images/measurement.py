@@ -406,54 +406,6 @@ class _BeadFit(ShadowFit):
         moved = np.linalg.solve(equations.plain[part], right)[:, TERMS : TERMS + 2]
         self.moved[rows] = np.sqrt(0.5 * (moved**2).sum(axis=(1, 2)))
 
-    def scatter_equation(self, count: int) -> tuple[float, float]:
-        """Return right-hand side and information of the share of scattered light.
-
-        They come from those of the first windows in which shadows touch; other parameters of the
-        windows are eliminated. The attenuation changes with the share such that isolated shadows
-        stay the same.
-        """
-        equation = np.zeros(2)
-        for rows, near in self.groups:
-            usable = (rows < count) & self.usable[rows] & ~self.disturbed[rows]
-            chosen = np.flatnonzero(usable & self._touching(rows, near))
-            rows, near = rows[chosen], near[chosen]
-            light, jacobian = self._model(rows, near)
-            by_scatter = self._by_scatter(rows, near, light, jacobian)
-            weight = self._valid(rows, self.grey[rows], light) / self.noise.variance(light)
-            both = np.concatenate([jacobian, by_scatter[:, None].astype(DTYPE)], axis=1)
-            weighted = both * weight[:, None]
-            normal = (weighted @ np.swapaxes(both, 1, 2)).astype(float)
-            diagonal = np.arange(jacobian.shape[1])
-            normal[:, diagonal, diagonal] += self._prior(rows, near) + 1e-12
-            residual = (self.grey[rows] - light)[..., None]
-            columns = np.concatenate([weighted @ residual, normal[:, :, -1:]], axis=2)
-            eliminated = np.linalg.solve(normal[:, :-1, :-1], columns[:, :-1])
-            equation += (columns[:, -1:] - normal[:, -1:, :-1] @ eliminated).sum(axis=(0, 1))
-        # Both windows of a pair contain the overlap.
-        right, information = 0.5 * equation / self.typical()
-        return float(right), float(information)
-
-    def _by_scatter(
-        self,
-        rows: NDArray[np.int64],
-        near: NDArray[np.int64],
-        light: NDArray[np.float32],
-        jacobian: NDArray[np.float32],
-    ) -> NDArray[np.floating]:
-        """Return derivatives (g, m) of light by the share s of scattered light.
-
-        Let beads absorb shares x of the direct light, and keep (1 - s) x. Then the derivative of
-        s + (1 - s) prod(1 - x) is 1 - prod(1 - x) (1 + sum(x / (1 - x))): for one bead it is 0,
-        for two beads the product of both x.
-        """
-        depth = self.depth[np.concatenate([rows[:, None], near], axis=1)][..., None]
-        scatter = self.profile.scatter
-        plane = self._plane(rows)
-        passed = (light - scatter * plane) / (1 - scatter)
-        by_depth = (depth * jacobian[:, TERMS + 2 :: 3]).sum(axis=1) / (1 - scatter)
-        return plane * (1 + 2 * self._crossing_in(rows)) - passed + by_depth
-
     def absorbed(self) -> Absorbed:
         """Return the light absorbed by beads, in the pixels of beads with a good fit."""
         plane = self._plane(np.arange(len(self.uv)))
@@ -616,7 +568,7 @@ def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     first = imaging.profile.scatter
     weight = SCATTER_SD**-2.0
     for _ in range(SCATTER_ROUNDS):
-        right, information = fit.scatter_equation(len(overlapping))
+        right, information = _scatter_equation(fit, len(overlapping))
         before = imaging.profile
         step = (right + weight * (first - before.scatter)) / (information + weight)
         known = before.with_scatter(float(np.clip(before.scatter + step, LOW[3], HIGH[3])))
@@ -629,6 +581,56 @@ def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         if abs(known.scatter - before.scatter) < SCATTER_STEP:
             break
     return imaging
+
+
+def _scatter_equation(fit: _BeadFit, count: int) -> tuple[float, float]:
+    """Return right-hand side and information of the share of scattered light.
+
+    They come from those of the first windows in which shadows touch; other parameters of the
+    windows are eliminated. The attenuation changes with the share such that isolated shadows
+    stay the same.
+    """
+    equation = np.zeros(2)
+    for rows, near in fit.groups:
+        usable = (rows < count) & fit.usable[rows] & ~fit.disturbed[rows]
+        chosen = np.flatnonzero(usable & fit._touching(rows, near))
+        rows, near = rows[chosen], near[chosen]
+        light, jacobian = fit._model(rows, near)
+        by_scatter = _by_scatter(fit, rows, near, light, jacobian)
+        weight = fit._valid(rows, fit.grey[rows], light) / fit.noise.variance(light)
+        both = np.concatenate([jacobian, by_scatter[:, None].astype(DTYPE)], axis=1)
+        weighted = both * weight[:, None]
+        normal = (weighted @ np.swapaxes(both, 1, 2)).astype(float)
+        diagonal = np.arange(jacobian.shape[1])
+        normal[:, diagonal, diagonal] += fit._prior(rows, near) + 1e-12
+        residual = (fit.grey[rows] - light)[..., None]
+        columns = np.concatenate([weighted @ residual, normal[:, :, -1:]], axis=2)
+        eliminated = np.linalg.solve(normal[:, :-1, :-1], columns[:, :-1])
+        equation += (columns[:, -1:] - normal[:, -1:, :-1] @ eliminated).sum(axis=(0, 1))
+    # Both windows of a pair contain the overlap.
+    right, information = 0.5 * equation / fit.typical()
+    return float(right), float(information)
+
+
+def _by_scatter(
+    fit: _BeadFit,
+    rows: NDArray[np.int64],
+    near: NDArray[np.int64],
+    light: NDArray[np.float32],
+    jacobian: NDArray[np.float32],
+) -> NDArray[np.floating]:
+    """Return derivatives (g, m) of light by the share s of scattered light.
+
+    Let beads absorb shares x of the direct light, and keep (1 - s) x. Then the derivative of
+    s + (1 - s) prod(1 - x) is 1 - prod(1 - x) (1 + sum(x / (1 - x))): for one bead it is 0,
+    for two beads the product of both x.
+    """
+    depth = fit.depth[np.concatenate([rows[:, None], near], axis=1)][..., None]
+    scatter = fit.profile.scatter
+    plane = fit._plane(rows)
+    passed = (light - scatter * plane) / (1 - scatter)
+    by_depth = (depth * jacobian[:, TERMS + 2 :: 3]).sum(axis=1) / (1 - scatter)
+    return plane * (1 + 2 * fit._crossing_in(rows)) - passed + by_depth
 
 
 def _overlapping(

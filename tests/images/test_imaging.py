@@ -15,6 +15,7 @@ from fluoro_calib_ros.images.measurement import (
     Expected,
     Imaging,
     _BeadFit,
+    _by_scatter,
     _Sizes,
     _typical,
     circles,
@@ -439,7 +440,7 @@ def test_light_behind_two_beads_changes_with_the_scattered_light():
     fit._cross()
     rows, near = (np.concatenate(parts) for parts in zip(*fit.groups[1:]))
     before, jacobian = fit._model(rows, near)
-    slope = fit._by_scatter(rows, near, before, jacobian)
+    slope = _by_scatter(fit, rows, near, before, jacobian)
     change = 1e-3
     fit.profile = replace(profile, scatter=0.2 + change)
     fit.depth *= 0.8 / (0.8 - change)

@@ -755,7 +755,7 @@ def test_combined_targets_count_the_datum_once():
 
 @pytest.mark.parametrize('is_open', [True, False])
 def test_points_without_joint_covariances_count_an_open_datum_once(is_open):
-    """Images show all but shift, turn and scale. If they show turn and scale, no datum is open."""
+    """Images show all but shift, turn and scale; if they show a turn, the datum is not open."""
     rng = np.random.default_rng(8)
     n = 60
     sd = rng.uniform(0.05, 0.2, n)

@@ -826,7 +826,7 @@ def test_auto_selects_collocation_unless_cross_validation_is_worse():
     steps = np.where(squares[:, None] == 0, 1.0, -1.0) * [1.0, 0.7]
     stepped = replace(run, after=replace(run.after, residuals=run.after.residuals + steps))
     assert better_model(stepped, state) in ('local_linear', 'knn')
-    # A polynomial with terms that `parametric` lacks is no reason to choose `parametric`.
+    # A polynomial that the terms of `parametric` do not contain is no reason to choose it.
     x, y = (run.measured.network.uv - 512).T / 512
     polynomial = np.stack([20 * x**4 * y**3, -15 * x * y**5], axis=1)
     residuals = run.after.residuals - run.correction + polynomial

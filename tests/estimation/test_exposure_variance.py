@@ -190,7 +190,7 @@ ANGLES = np.deg2rad(np.linspace(-80.0, 85.0, 12))
 def estimated_terms(sd, random_px, seed=6, series_px=0.0):
     """Estimates of a series and of exposure terms that follow the angle, with their changes.
 
-    sd: standard deviation of the estimates; random_px: random change per exposure [px].
+    sd: standard deviation of the estimates [px]; random_px: random change of an exposure [px].
     """
     rng = np.random.default_rng(seed)
     exposures = len(ANGLES)

@@ -31,7 +31,7 @@ def calibration(seed, bump=0.0, gauge=0.0):
 
     bump [px]: a local change of the image; gauge: a scale that belongs to the principal distance.
     """
-    return _calibration(seed, bump, gauge)  # a cache tells a default from the same value
+    return _calibration(seed, bump, gauge)  # a cache keeps defaults apart from equal values
 
 
 @functools.cache

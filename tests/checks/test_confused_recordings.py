@@ -607,7 +607,7 @@ def test_what_is_doubtful_about_the_rig_stays_with_the_result(
     change, sentence, verdict, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(html_report, 'svg_text', lambda figure: '')
-    if change:  # a good rig passes every check, a bad one must fail those of the rig only
+    if change:  # a good rig passes every check; of a bad one, those of the rig matter
         monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     write_phantom(tmp_path / 'phantom.csv', rig().phantom)
     source = tmp_path / 'observations.csv'

@@ -134,8 +134,8 @@ def test_a_strain_that_nobody_would_see_is_taken_on_trust():
 @pytest.mark.parametrize(
     ('test', 'nse', 'limit'),
     [
-        (40.0, 1.0, 0.2 * np.sqrt(20 / 40)),  # exceeds chance
-        (40.0, 0.3, 0.2 * np.sqrt(0.25 / 0.3)),  # exceeds what matters
+        (40.0, 1.0, 0.2 * np.sqrt(20 / 40)),  # limit set by chance
+        (40.0, 0.3, 0.2 * np.sqrt(0.25 / 0.3)),  # limit set by what matters
         (5.0, 1.0, 0.4),
     ],
 )

@@ -179,7 +179,7 @@ def test_good_calibration_passes():
 
 
 def test_distortion_without_a_model_fails():
-    """The trend in its residuals and held-out exposures, whose residuals are no noise, show it."""
+    """Shown by the trend in residuals and by held-out exposures, whose residuals are no noise."""
     found = verdict(model='none')
     assert found.verdict == 'fail' and {'whiteness', 'worst_area', 'held_out'} <= failed(found)
     # Whatever is claimed, nothing is corrected: the trend is the achieved precision.

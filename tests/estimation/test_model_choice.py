@@ -54,7 +54,7 @@ def case(gauge=GaugeKind.FULL, modes=10, **shape):
 
 
 def held_out_densely(design, precision, values, weight, fold):
-    """Predict values (N, 2) with functions (N, 2, p) fitted to all folds but the own one."""
+    """Predict values (N, 2) with functions (N, 2, p) fitted to all folds except their own."""
     out = np.empty_like(values)
     for number in np.unique(fold):
         used = fold != number

@@ -502,7 +502,7 @@ def test_noise_of_calibrations_is_that_of_the_median():
 
 
 def test_image_points_are_weighted_by_what_a_calibration_claims_there():
-    """Points without sigma get that of the noise profile; the correction's is added everywhere."""
+    """The noise profile applies to points without sigma, the sd of the correction to all."""
     network, truth = rigs.small_network(3, 20, 2)
     start = measured(network, truth)
     told = np.full(20, 0.7)

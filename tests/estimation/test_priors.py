@@ -200,7 +200,7 @@ def normalized_squares(functions, error, covariances):
 
 @pytest.mark.parametrize(('count', 'too_small'), [(40, (1.3, 1.7)), (400, (0.95, 1.15))])
 def test_claims_hold_where_the_signal_is_only_estimated(count, too_small):
-    """With few image points, the most likely signal alone claims too small errors."""
+    """With few image points, the most likely signal alone understates the errors."""
     functions = Functions(SIZE, -1, 6)
     rng = np.random.default_rng(1)
     uv = image_points(count)

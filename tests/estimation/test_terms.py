@@ -106,7 +106,7 @@ def test_gauge_of_a_cubic_trend_is_that_of_the_best_cubic_polynomial():
     """Affinity and decentring are not part of the gauge, though not orthogonal to it."""
     rng = np.random.default_rng(2)
     interior = np.array([480.0, 530.0, 2000.0])
-    uv = rng.uniform(0, 700, (400, 2))  # off-centre of the principal point
+    uv = rng.uniform(0, 700, (400, 2))  # not centred on the principal point
     x, y = (uv - interior[:2]).T / 512
     brown = np.stack([x * (x * x + y * y) + 3 * x * x + y * y, y * (x * x + y * y) + 2 * x * y], 1)
     affine = np.stack([x + 0.3 * y, -y + 0.3 * x], axis=1)

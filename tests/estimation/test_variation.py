@@ -129,7 +129,7 @@ def test_what_a_series_cannot_follow_is_part_of_its_standard_deviation():
 
 
 def test_residuals_bound_the_variance_beyond_a_series():
-    """A covariance function that expects too much is corrected, too little is not."""
+    """A covariance function that expects too much is corrected, one that expects little is not."""
     uv, exposure, rng = image_points(4, 200)
     series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.zeros((SD_GRID, SD_GRID)))
     noise = rng.normal(0, NOISE, uv.shape)
@@ -189,7 +189,7 @@ def test_rejected_points_that_agree_are_an_error_of_the_correction():
     wrong = rng.normal(0, 20.0, (len(false), 2))
     nothing = sd_of_rejected(inliers, FittedPoints(uv[false], wrong, exposure[false]), series)
     assert (nothing > 0).mean() < 0.02
-    # Of many such small residuals, some agree by chance.
+    # Many residuals of this size agree by chance, so they show no error.
     small = wrong / np.linalg.norm(wrong, axis=1)[:, None] * 5 * NOISE
     nothing = sd_of_rejected(inliers, FittedPoints(uv[false], small, exposure[false]), series)
     assert not nothing.any()

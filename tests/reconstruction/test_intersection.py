@@ -164,7 +164,7 @@ def test_pycolmap_triangulates_the_same_points():
     _, uv, sigma = seen(orientation, 10)
     found = Intersector(orientation).intersect(uv, sigma)
     cameras = []
-    for xp, yp, c in orientation.interior:  # its pixel coordinates start at the image corner
+    for xp, yp, c in orientation.interior:  # COLMAP pixels start at the image corner
         cameras.append(
             pycolmap.Camera(
                 model='SIMPLE_PINHOLE', width=1024, height=1024, params=[c, xp + 0.5, yp + 0.5]

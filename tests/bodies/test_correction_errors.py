@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of the correction of markers that move: what their means have in common."""
+"""Correction errors of moving markers: what the mean errors have in common."""
 
 import numpy as np
 import pytest
@@ -18,13 +18,13 @@ CORRECTION_PX = 0.1
 
 
 def paths(rng, exposures=40, swing=0.1):
-    """Image points (T, m, F, 2) of markers that move, in sides of the image."""
+    """Image points (T, m, F, 2) of moving markers, in units of the image side."""
     start = rng.uniform(0.4, 0.6, (5, 2, 2))
     return start + swing * rng.normal(0, 1, (exposures, 1, 2, 2))
 
 
 def field_at(rng, uv, draws):
-    """Draws (n, k) of a field with the correlation exp(-distance / REACH) at pixels (k, 2)."""
+    """Draws (n, k) of a field with correlation exp(-distance / REACH) at pixels (k, 2)."""
     distance = np.linalg.norm(uv[:, None] - uv[None], axis=2)
     root = np.linalg.cholesky(np.exp(-distance / REACH) + 1e-10 * np.eye(len(uv)))
     return rng.normal(0, 1, (draws, len(uv))) @ root.T
@@ -55,7 +55,7 @@ def test_errors_of_a_marker_that_stands_still_stay_and_those_of_one_that_moves_f
 
 
 def test_learned_shapes_scatter_as_claimed_where_corrections_have_errors():
-    """Views along x and y see a body that moves; its image points have the errors of a field."""
+    """Views along x and y see a moving body; the image points have the errors of a field."""
     rng = np.random.default_rng(3)
     squares = []
     for _ in range(30):
@@ -87,5 +87,5 @@ def test_learned_shapes_scatter_as_claimed_where_corrections_have_errors():
         away = (shape.xyz_mm - CORNERS @ turned.T - shift).ravel()
         variance, axes = np.linalg.eigh(shape.covariance_mm2)
         squares.append(np.mean((axes[:, 6:].T @ away) ** 2 / variance[6:]))
-    # 30 shapes of 6 parameters: the mean has a standard deviation of 0.1.
+    # 30 shapes with 6 parameters each: the mean has a standard deviation of 0.1.
     assert 0.65 < np.mean(squares) < 1.35

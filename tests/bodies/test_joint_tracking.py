@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A joint exposure by exposure has the angles of the whole trial."""
+"""Joint angles computed exposure by exposure equal those of the whole trial."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ FIRST = 11  # number of the first exposure
 
 
 def poses(body, turns):
-    """Poses with turns (T, 3) [rad] about x, y and z."""
+    """Poses with rotation vectors (T, 3) [rad] about x, y and z."""
     count = len(turns)
     covariance = np.broadcast_to(np.diag([0.01, 0.01, 0.01, 1e-6, 2e-6, 3e-6]), (count, 6, 6))
     number = FIRST + np.arange(count)
@@ -40,7 +40,7 @@ def poses(body, turns):
 
 @pytest.fixture
 def trial():
-    """Femur at rest, tibia that turns more than once about x."""
+    """A femur at rest, and a tibia that makes more than one full turn about x."""
     turn = np.linspace(0.2, 9.0, COUNT)
     tibia = poses('tibia', np.column_stack([turn, 0.1 * np.sin(turn), 0.2 * np.cos(turn)]))
     return poses('femur', np.zeros((COUNT, 3))), tibia
@@ -52,7 +52,7 @@ def one_by_one(tracker, trial):
 
 
 def test_angles_are_those_of_the_whole_trial(trial):
-    """Full turns, too."""
+    """Also after full turns."""
     found = one_by_one(JointTracker(JOINT), trial)
     expected = joint_motion(JOINT, *trial)
     assert np.allclose(np.concatenate([one.angles for one in found]), expected.angles, atol=1e-12)
@@ -75,7 +75,7 @@ def test_angles_after_the_neutral_trial_are_those_of_the_whole_trial(trial):
 
 
 def test_neutral_trial_that_ends_between_two_exposures_is_used(trial):
-    """The last exposures of it are missing."""
+    """The last exposures of the neutral trial are missing."""
     tracker = JointTracker(JOINT, (FIRST + 2, FIRST + 6))
     kept = [row for row in range(COUNT) if row not in (5, 6)]
     found = [tracker.add(*(one.rows(np.arange(COUNT) == row) for one in trial)) for row in kept]

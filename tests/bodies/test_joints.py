@@ -60,7 +60,7 @@ def random_poses(rng, body, count, **errors):
 
 
 def random_covariance(rng, scale=1.0):
-    """Covariance (6, 6) of a pose, of some 0.2 mm and 0.005 rad, with correlations."""
+    """Covariance (6, 6) of a pose with correlations, about 0.2 mm and 0.005 rad."""
     root = rng.normal(size=(6, 6)) * np.r_[[0.1] * 3, [2e-3] * 3][:, None] * scale
     return root @ root.T
 
@@ -75,7 +75,7 @@ def turn(axis, degrees):
 
 @pytest.mark.parametrize('name', [n for n in CONVENTIONS if n not in CLINICAL])
 def test_cardan_and_euler_angles_are_those_of_scipy(name):
-    """All 12 sequences, of the rotation distal -> proximal; translations along proximal axes."""
+    """All 12 sequences, for the rotation distal -> proximal; translations along proximal axes."""
     rng = np.random.default_rng(1)
     joint = Joint('j', 'p', 'd', name, random_frame(rng), random_frame(rng))
     p, d = random_poses(rng, 'p', 50), random_poses(rng, 'd', 50)
@@ -151,9 +151,9 @@ def alone(name, rotation, side='right', position=(0.0, 0, 0)):
 
 
 def test_clinical_signs_of_a_right_knee():
-    """By where the distal end of the tibia, its front or its origin goes. x is to the right."""
+    """Check where the distal end, front or origin of the tibia moves. x points to the right."""
     assert alone('grood_suntay_knee', turn('x', -30))['flexion'] == pytest.approx(30)
-    # The heel goes back: the distal end (-z) has a negative y.
+    # The heel moves back: the distal end (-z) gets a negative y.
     assert (turn('x', -30) @ [0, 0, -1])[1] < 0
     assert alone('grood_suntay_knee', turn('y', 5))['adduction'] == pytest.approx(5)
     assert (turn('y', 5) @ [0, 0, -1])[0] < 0  # to the left, which is medial
@@ -164,7 +164,7 @@ def test_clinical_signs_of_a_right_knee():
 
 
 def test_clinical_signs_of_isb():
-    """Axes: x anterior, y proximal, z right; of a right limb."""
+    """Axes of a right limb: x anterior, y proximal, z right."""
     down = np.array([0, -1, 0])
     cases = [
         ('isb_hip', turn('z', 20), 'flexion', 0, 1),  # the knee goes forward
@@ -201,7 +201,7 @@ def test_clinical_signs_of_isb():
 
 @pytest.mark.parametrize('name', CLINICAL)
 def test_a_left_limb_is_a_mirrored_right_one(name):
-    """The same angles, translations and standard deviations as its mirror image."""
+    """Angles, translations and standard deviations equal those of the mirror image."""
     rng = np.random.default_rng(3)
     of = convention(name)
     mirror = of.mirror('left')
@@ -231,7 +231,7 @@ def test_a_left_limb_is_a_mirrored_right_one(name):
 
 
 def perturbed(x, error):
-    """Poses with errors (T, 6) as BodyPoses has them."""
+    """Poses displaced by errors (T, 6) in the convention of BodyPoses."""
     return dataclasses.replace(
         x,
         rotation=Rotation.from_rotvec(error[:, 3:]).as_matrix() @ x.rotation,
@@ -246,7 +246,7 @@ def vector(motion):
 @pytest.mark.parametrize('side', ['left', 'right'])
 @pytest.mark.parametrize('name', ['cardan_zyx', 'euler_yzy', *CLINICAL])
 def test_covariance_is_that_of_finite_differences(name, side):
-    """Full covariances of both poses, the common unknowns of the rig stacked."""
+    """Full covariances of both poses, with the common unknowns of the rig stacked."""
     rng = np.random.default_rng(4)
     joint = Joint('j', 'p', 'd', name, random_frame(rng), random_frame(rng), side)
     own = [1e-4 * random_covariance(rng) for _ in range(4)]
@@ -287,7 +287,7 @@ def test_covariance_is_that_of_finite_differences(name, side):
 
 
 def test_errors_of_the_rig_cancel():
-    """A rotation of the whole rig turns both bodies, and changes no angle and no translation."""
+    """Rotating the whole rig rotates both bodies and changes no angle and no translation."""
     rng = np.random.default_rng(5)
     p, d = random_poses(rng, 'p', 10), random_poses(rng, 'd', 10)
 
@@ -305,7 +305,7 @@ def test_errors_of_the_rig_cancel():
 
 
 def near_lock(name, sd_deg, distance_deg):
-    """Error (T, 6) and covariance of a joint near gimbal lock, as measured, and the status."""
+    """Error (T, 6), covariance and status of a joint measured near gimbal lock."""
     rng = np.random.default_rng(6)
     of = convention(name)
     distance = np.deg2rad(distance_deg(rng))
@@ -355,18 +355,18 @@ def test_standard_deviations_near_gimbal_lock(name, sd_deg):
 
 @pytest.mark.parametrize('name', ['grood_suntay_knee', 'isb_glenohumeral'])
 def test_standard_deviations_in_gimbal_lock(name):
-    """Within three sd of it, of rotations that are equally likely; a linear covariance fails."""
+    """Rotations uniform within three sd of lock, where a linear covariance fails."""
     error, covariance, status = near_lock(
         name, 1.0, lambda rng: 3 * np.sqrt(rng.uniform(0, 1, 600))
     )
-    assert (status == JointStatus.GIMBAL).mean() > 0.97  # noise takes some out of five sd
+    assert (status == JointStatus.GIMBAL).mean() > 0.97  # noise moves some beyond five sd
     assert 0.85 < nse(error, covariance).mean() < 1.3
-    sd_of_a_turn = np.pi / np.sqrt(3)  # of an angle that may have any value
+    sd_of_a_turn = np.pi / np.sqrt(3)  # sd of an angle that may have any value
     assert np.sqrt(covariance[:, 0, 0]).max() < 1.1 * sd_of_a_turn
 
 
 def test_angles_count_full_turns():
-    """Also where exposures without a pose and noise in gimbal lock lie between."""
+    """Also across exposures without a pose, and across noise in gimbal lock."""
     steps = np.deg2rad(np.arange(0, 900, 20))
     rotation = Rotation.from_euler('z', steps[:, None]).as_matrix()
     rotation[10:14] = np.nan
@@ -380,7 +380,7 @@ def test_angles_count_full_turns():
     later = joint_motion(joint, p, poses('d', rotation), before=np.array([4 * np.pi + 0.1, 0, 0]))
     np.testing.assert_allclose(later.angles[known, 0], steps[known] + 4 * np.pi, atol=1e-9)
 
-    # Turning round in lock, the first angle passes all values; afterwards it is what it was.
+    # The first angle takes all values during turns in lock; afterwards it has its old value.
     around = np.deg2rad(np.arange(0, 720, 40))
     locked = Rotation.from_euler(
         'ZXY',
@@ -398,7 +398,7 @@ def test_angles_count_full_turns():
 
 
 def test_exposure_by_exposure_gives_the_numbers_of_the_trial():
-    """To the last bit, with turns, missing poses and gimbal lock."""
+    """Results agree to the last bit, with turns, missing poses and gimbal lock."""
     rng = np.random.default_rng(11)
     count = 120
     angles = np.column_stack(
@@ -442,7 +442,7 @@ def test_status_is_that_of_the_worse_body():
 
 @pytest.mark.parametrize('side', ['left', 'right'])
 def test_a_neutral_trial_makes_zero(side):
-    """In the mean over the trial; its noise is part of the covariance, by Monte Carlo."""
+    """The mean over the trial is zero; its noise is part of the covariance, by Monte Carlo."""
     rng = np.random.default_rng(8)
     joint = Joint('j', 'p', 'd', 'grood_suntay_knee', random_frame(rng), random_frame(rng), side)
     noise = np.diag([0.05] * 3 + [0.01, 0.02, 0.03]) ** 2
@@ -480,9 +480,9 @@ def test_a_neutral_trial_makes_zero(side):
 
 
 def mannequin(kind, side):
-    """Landmarks of a bone whose axes are those of the room, of a person without asymmetry.
+    """Landmarks of a bone whose axes are those of the room, for a symmetric person.
 
-    Coordinates as right (of the person), front, up; medial and lateral by side.
+    Coordinates are right (of the person), front, up; medial and lateral depend on the side.
     """
     out = 1 if side == 'right' else -1
     places = {
@@ -531,7 +531,7 @@ def mannequin(kind, side):
 @pytest.mark.parametrize('side', ['left', 'right'])
 @pytest.mark.parametrize('kind', LANDMARK_FRAMES)
 def test_frames_of_landmarks(kind, side):
-    """Axes to the front, up and to the right, of a bone somewhere in the CT."""
+    """Axes point to the front, up and right, for a bone anywhere in the CT."""
     rng = np.random.default_rng(9)
     to_ct = Rotation.random(random_state=rng).as_matrix()
     shift = rng.normal(0, 100, 3)
@@ -545,7 +545,7 @@ def test_frames_of_landmarks(kind, side):
 
 
 def test_the_second_landmark_direction_only_spans_a_plane():
-    """The mechanical axis of the femur is kept, the posterior condyles are made perpendicular."""
+    """The mechanical axis of the femur is kept; the posterior condyles are made perpendicular."""
     landmarks = mannequin('femur_grood_suntay', 'right')
     landmarks['lateral_posterior_condyle'] = np.array([25.0, -20, 15])
     frame = frame_of_landmarks('femur_grood_suntay', landmarks, 'right')
@@ -650,7 +650,7 @@ def test_wrong_joints_and_frames_are_refused(make, cause):
 
 
 def test_two_joints_of_one_bone_are_no_cycle():
-    """The shoulder: the humerus relative to the thorax and to the scapula."""
+    """Shoulder: humerus relative to the thorax and to the scapula."""
     pairs = (('thorax', 'scapula'), ('scapula', 'humerus'), ('thorax', 'humerus'))
     joints = [Joint(f'{a}-{b}', a, b, 'cardan_xyz') for a, b in pairs]
     check_joints(joints, ['thorax', 'scapula', 'humerus'])

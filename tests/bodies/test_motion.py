@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Smoothing against a batch least-squares solution, honest variances, and the best Butterworth."""
+"""Smoothing against batch least squares, honest variances, and the best Butterworth filter."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ SD = np.array([0.05, 0.05, 0.05, 0.002, 0.002, 0.002])
 
 
 def gait(t):
-    """A sum of harmonics of a step a second."""
+    """Sum of harmonics of a gait with one step per second."""
     sizes = [60, 18, 6, 2, 1]
     return sum(size * np.sin(2 * np.pi * (k + 1) * t + k) for k, size in enumerate(sizes))
 
@@ -43,7 +43,7 @@ def landing(t):
 
 
 def trial(motion, seconds=0.8, seed=0, bodies=3):
-    """True centres (T, B, 3) and rotations, and what each exposure tells."""
+    """True centres (T, B, 3) and rotations, and the information of each exposure."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, 1 / RATE)
     phase = 0.02 * np.arange(bodies)
@@ -66,7 +66,7 @@ def trial(motion, seconds=0.8, seed=0, bodies=3):
 
 
 def follow(seen, lag=None):
-    """A filter that has followed a trial, and its reports."""
+    """A filter after following a trial, and its reports."""
     bodies = len(seen[0].centre_mm)
     follower = MotionFilter(bodies, lag)
     reports = []
@@ -91,8 +91,8 @@ def errors(motion, centre, turn):
 
 
 def best_butterworth(values, true):
-    """Smallest RMS error of zero-lag Butterworth filters, whose cutoff is chosen by the truth."""
-    from scipy.signal import butter, filtfilt  # half a second, in each worker
+    """Smallest RMS error of zero-lag Butterworth filters, with the cutoff chosen by the truth."""
+    from scipy.signal import butter, filtfilt  # slow import: half a second in each worker
 
     return min(
         np.sqrt(np.mean((filtfilt(*butter(2, cutoff, fs=RATE), values, axis=0) - true) ** 2))
@@ -101,9 +101,9 @@ def best_butterworth(values, true):
 
 
 def test_smoother_is_least_squares_of_the_whole_trial():
-    """Positions, with given densities, against a dense solution of all states and noises.
+    """Positions with given densities, against a dense solution of all states and noises.
 
-    Rotations are known to a microradian: else they and positions are not independent.
+    Rotations are known to a microradian, as otherwise they and positions are not independent.
     """
     rng = np.random.default_rng(1)
     count = 12
@@ -145,7 +145,7 @@ def test_smoother_is_least_squares_of_the_whole_trial():
 
 
 def test_derivatives_by_the_densities_are_those_of_the_likelihood():
-    """The score of the smoother against differences of the likelihood of all innovations."""
+    """Score of the smoother against differences of the likelihood of all innovations."""
     _, _, _, seen = trial(gait, 0.12, bodies=1)
     rng = np.random.default_rng(2)
     log_q = np.column_stack([rng.uniform(14, 17, len(seen)), rng.uniform(6, 9, len(seen))])
@@ -170,7 +170,7 @@ def test_derivatives_by_the_densities_are_those_of_the_likelihood():
         for sign, h in zip((1, -1), shifted):
             h[k, kind] += sign * 1e-3
         numeric = (run(shifted[0])[0] - run(shifted[1])[0]) / 2e-3
-        # Rotations are not quite linear: 2 % of a score of the size of one.
+        # Rotations are slightly nonlinear: 2 % for scores of size one.
         assert score[k, kind] == pytest.approx(numeric, rel=0.02, abs=0.02)
 
 
@@ -195,7 +195,7 @@ def test_poses_follow_twists_and_back():
     first = Rotation.random(5, random_state=rng).as_matrix(), rng.normal(0, 20, (5, 3))
     twist = rng.normal(0, 1, (5, 6)) * [20, 20, 20, 1, 1, 1]
     assert twist_between(first, pose_after(*first, twist)) == pytest.approx(twist, abs=1e-9)
-    # A rotation about a line leaves the points on it where they are.
+    # A rotation about a line leaves the points on that line in place.
     point = np.array([3.0, -8.0, 5.0])
     line = np.array([0.3, 0.5, -0.4])
     turn = np.concatenate([-np.cross(line, point), line])
@@ -205,7 +205,7 @@ def test_poses_follow_twists_and_back():
 
 
 def test_where_exposures_are_linearised_does_not_matter_to_what_they_do_not_see():
-    """Two markers: exposures at any turn about their line tell the same, and not this turn."""
+    """With two markers, the information is independent of the rotation about their line."""
     rng = np.random.default_rng(6)
     truth = Rotation.random(random_state=rng).as_matrix()
     markers = np.array([[8.0, -3, 2], [-5, 6, 4]]) @ truth.T
@@ -268,7 +268,7 @@ def test_errors_are_smaller_than_with_the_best_cutoff_and_as_claimed(motion, lim
     for body in range(3):
         best = best_butterworth(measured[:, body], centre[:, body])
         assert np.sqrt(np.mean(away[:, body, :3] ** 2)) < limit * best
-    # 3600 errors that are correlated over some five exposures: 3 sd of their mean square.
+    # 3600 errors correlated over about five exposures: 3 sd of their mean square.
     assert 0.7 < np.mean((away / sd) ** 2) < 1.3
 
 
@@ -297,7 +297,7 @@ def test_a_lag_is_the_smoother_of_what_was_seen_until_then():
 
 @pytest.mark.long
 def test_a_gap_is_as_unsure_as_it_is():
-    """12 exposures without a marker: errors as claimed, larger in the middle."""
+    """12 exposures without a marker: errors are as claimed, and larger in the middle."""
     _, centre, turn, seen = trial(gait, 0.5, bodies=5)
     for one in seen[60:72]:
         one.normal[:] = 0
@@ -308,7 +308,7 @@ def test_a_gap_is_as_unsure_as_it_is():
 
 
 def test_rotations_of_full_turns_are_followed():
-    """A body that turns by 20 rad/s, several times round."""
+    """A body that rotates at 20 rad/s through several full turns."""
     count = 120
     rng = np.random.default_rng(5)
     angle = 20 * np.arange(count) / RATE

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses of one exposure: scatter against covariance, bound, scipy, and false markers."""
+"""Poses from one exposure: scatter against covariance, bound, scipy, and false markers."""
 
 import numpy as np
 import pytest
@@ -122,7 +122,7 @@ def test_pose_is_that_of_scipy():
 
 @pytest.mark.parametrize('view', [0, 1])
 def test_one_view_contributes_what_it_sees(view):
-    """With a prediction, the pose of a single view scatters as claimed."""
+    """With a prediction, the pose from a single view scatters as claimed."""
     rng = np.random.default_rng(3)
     rig = orientation()
     sd = np.array([2.0, 2, 2, 0.02, 0.02, 0.02])
@@ -151,8 +151,7 @@ def test_one_view_contributes_what_it_sees(view):
                 vector_from_matrix(told.rotation[0] @ rotation.T),
             ]
         )
-        # At the point of linearisation the data pull by `right`; together with the prediction
-        # they are in balance there.
+        # At the linearisation point, the data pull by `right`, in balance with the prediction.
         normal = told.normal[0]
         values, vectors = np.linalg.eigh(normal)
         seen = values > 1e-3 * values.max()
@@ -197,11 +196,11 @@ def test_true_markers_are_kept():
             observed(rig, given.target_id, points, rng), UNKNOWN
         )
         kept.append(found.used.sum())
-    assert sum(kept) >= 150 * 6 - 3  # 1 of 16,000 markers is beyond four standard deviations
+    assert sum(kept) >= 150 * 6 - 3  # 1 of 16,000 markers exceeds four standard deviations
 
 
 def test_markers_that_contradict_each_other_by_far_leave_a_frame_without_a_pose():
-    """Precise markers that all disagree are excluded until the rest is singular."""
+    """Precise markers that all disagree are excluded until the pose is singular."""
     rng = np.random.default_rng(9)
     rig = orientation()
     left = []
@@ -228,7 +227,7 @@ def test_two_markers_give_no_pose_alone():
 
 
 def test_a_prediction_that_all_markers_contradict_rejects_none():
-    """A body that has been hit, of which the exposure alone does not give the pose."""
+    """A body has been hit, and the exposure alone does not determine its pose."""
     rng = np.random.default_rng(8)
     rig = orientation()
     given = body(rng, 4)
@@ -257,7 +256,7 @@ def test_markers_on_a_line_give_no_rotation_about_it():
 
 
 def flat_from_one_view(thickness, prediction_sd, blind=1):
-    """A body of four markers near a plane, tilted by 20 degrees to the view that sees it."""
+    """A body of four nearly coplanar markers, tilted by 20 degrees to the view that sees it."""
     rng = np.random.default_rng(11)
     rig = orientation()
     corners = np.array([[-10.0, -10, 0], [10, -9, 0], [9, 11, 0], [-11, 8, 0]])
@@ -280,7 +279,7 @@ def test_a_flat_body_that_one_view_sees_is_ambiguous_unless_the_prediction_tells
     assert flat_from_one_view(0.0, 0.5).ambiguous[0]
     assert not flat_from_one_view(0.0, 0.03).ambiguous[0]
     assert not flat_from_one_view(8.0, 0.5).ambiguous[0]
-    # The second pose is the reflection at the line of sight of the view that sees it.
+    # The second pose is the reflection at the line of sight of the view that sees the body.
     assert flat_from_one_view(0.0, 0.5, blind=0).ambiguous[0]
 
 

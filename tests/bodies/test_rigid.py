@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rigid motions of points of which some are false."""
+"""Rigid motions of points, some of which are false."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Shapes from a recording and CT: scatter as claimed, and what is wrong with a body."""
+"""Shapes from a recording and CT: scatter as claimed, and findings on a body."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [1
 
 
 def recording(rng, true, exposures=200, fixed_mm=0.0, lost=0.1):
-    """Places of markers (m, 3) of a body that moves."""
+    """Places of the markers (m, 3) of a moving body."""
     count = len(true)
     turn = Rotation.from_rotvec(rng.normal(0, 0.4, (exposures, 3))).as_matrix()
     places = true @ np.swapaxes(turn, 1, 2) + rng.normal(0, 30, (exposures, 1, 3))
@@ -62,14 +62,14 @@ def test_coordinates_scatter_as_claimed(fixed_mm):
         moved = (CORNERS @ rotation.T + shift).mean(axis=0) - CORNERS.mean(axis=0)
         away = np.concatenate([moved, vector_from_matrix(rotation)])
         frame.append(away @ np.linalg.solve(shape.body.frame_covariance, away) / 6)
-    # The mean of three coordinates stands for each of them, and rounding for 6 of 15.
+    # One sd stands for three coordinates; in 6 of 15 directions, errors are only rounding.
     assert 0.6 < np.mean(np.square(relative)) < 1.5
     if not fixed_mm:
         assert np.mean(frame) == pytest.approx(1, abs=0.35)
 
 
 def test_errors_of_ct_are_recovered():
-    """0.1 mm of CT become 0.02 mm or less after 10 s at 60 Hz."""
+    """CT errors of 0.1 mm become 0.02 mm or less after 10 s at 60 Hz."""
     rng = np.random.default_rng(2)
     shape = estimate_shape(by_ct(rng, CORNERS), recording(rng, CORNERS, 600))
     assert np.sqrt(np.mean(relative_errors(shape, CORNERS) ** 2)) < 0.02
@@ -78,7 +78,7 @@ def test_errors_of_ct_are_recovered():
 
 
 def test_covariance_is_that_of_the_errors_in_the_datum_of_the_markers():
-    """Of 12 coordinates 6 are the motion of the body, which has no error."""
+    """6 of 12 coordinates are the motion of the body, which has no error."""
     rng = np.random.default_rng(7)
     true = CORNERS[:4]
     squares = []
@@ -93,7 +93,7 @@ def test_covariance_is_that_of_the_errors_in_the_datum_of_the_markers():
 
 
 def test_false_places_are_left_out():
-    """Three of 1000 are false matches by 100 mm; a marker with many of them is loose."""
+    """Three of 1000 are false matches by up to 100 mm; a marker with many of them is loose."""
     rng = np.random.default_rng(8)
     places = recording(rng, CORNERS, 400, lost=0.0)
     clean = estimate_shape(unknown(), places)
@@ -163,7 +163,7 @@ def test_wrong_coordinates_of_ct_are_named(change, kind, markers):
     shape = estimate_shape(body, recording(rng, CORNERS))
     assert kinds(shape.findings) == [kind]
     assert shape.findings[0].place.target_id == markers
-    if markers:  # what CT says of them has no part in the shape
+    if markers:  # their CT coordinates do not contribute to the shape
         assert np.abs(relative_errors(shape, CORNERS)).max() < 0.03
 
 

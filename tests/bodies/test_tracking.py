@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A knee followed from image points: gaps, single views, impacts, and the job around it."""
+"""Tracking a knee from image points: gaps, single views, impacts, and the job around it."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ COUNT = 90
 
 
 class Trial:
-    """Two bodies in motion, and their exposures."""
+    """Two moving bodies and their exposures."""
 
     def __init__(self, seed=0, lost=0.0, hidden=None, count=COUNT):
         rng = np.random.default_rng(seed)
@@ -51,7 +51,7 @@ class Trial:
             self.exposures.append(exposure(self.rig, self.ids, uv, Noise(0.2)))
 
     def follow(self, lag=None):
-        """The tracker, and what it reported."""
+        """The tracker and its reports."""
         tracker = BodyTracker(self.rig, self.bodies, lag=lag)
         found = [
             tracker.add(one, k, 1 + round(1e9 * k / RATE)) for k, one in enumerate(self.exposures)
@@ -59,7 +59,7 @@ class Trial:
         return tracker, [one for one in found if one is not None]
 
     def errors(self, poses, row):
-        """Standardised errors (T, 6) of poses of a body."""
+        """Errors (T, 6) of the poses of a body, and their standard deviations."""
         away = np.concatenate(
             [
                 poses.position_mm - self.position[row],
@@ -71,7 +71,7 @@ class Trial:
 
 
 def test_one_image_point_a_view_is_never_believed_to_give_the_pose():
-    """Two markers, each in one view for 80 ms: live errors stay within 4.5 standard deviations."""
+    """Two markers, each in one view for 80 ms: live errors stay below 4.5 standard deviations."""
 
     def hidden(k, uv):
         if k % 40 >= 20:
@@ -106,7 +106,7 @@ def test_a_trial_is_smoothed_with_honest_deviations():
 
 
 def test_poses_are_predicted_any_number_of_times_and_shapes_replaced_on_the_way():
-    """A prediction changes nothing, nor does a shape with other markers in the same frame."""
+    """Neither a prediction nor a shape with other markers in the same frame changes results."""
     trial = Trial(2)
     _, expected = trial.follow(lag=0)
     tracker = BodyTracker(trial.rig, trial.bodies)
@@ -128,19 +128,19 @@ def test_poses_are_predicted_any_number_of_times_and_shapes_replaced_on_the_way(
 
 
 def test_markers_that_come_and_go_make_no_jump():
-    """A third of all image points is lost: nowhere more than five standard deviations off."""
+    """A third of all image points is lost; errors stay below five standard deviations."""
     trial = Trial(1, lost=0.35)
     tracker, _ = trial.follow()
     for row, poses in enumerate(poses_of(trial.bodies, tracker.smoothed())):
         away, sd = trial.errors(poses, row)
         known = np.isfinite(away).all(axis=1)
-        assert known[30:].all()  # the first exposure with three markers in both views starts
+        assert known[30:].all()  # tracking starts when both views first see three markers
         assert np.abs(away[known] / sd[known]).max() < 5
         assert {PoseStatus.OK, PoseStatus.WEAK} <= set(poses.status.tolist())
 
 
 def hide(first, last, keep):
-    """Hide image points of the femur in some exposures, but those with indices (view, marker)."""
+    """Hide image points of the femur in some exposures, except those at indices (view, marker)."""
 
     def hidden(k, uv):
         if first <= k < last:
@@ -157,7 +157,7 @@ def hide(first, last, keep):
     ('keep', 'status'),
     [
         ([(0, 0), (0, 1)], PoseStatus.WEAK),
-        ([(0, 0), (0, 1), (0, 2), (0, 3)], PoseStatus.OK),  # one view gives a pose
+        ([(0, 0), (0, 1), (0, 2), (0, 3)], PoseStatus.OK),  # one view suffices for a pose
         ([], PoseStatus.FILLED),
     ],
 )
@@ -204,7 +204,7 @@ def test_an_exposure_that_is_not_later_is_not_taken():
 
 @pytest.mark.long
 def test_stamps_of_arrival_lose_no_body():
-    """Exposures that are stamped when they arrive, some within a tenth of a millisecond."""
+    """Exposures are stamped on arrival, some within a tenth of a millisecond."""
     trial = Trial(seed=4, count=600)
     rng = np.random.default_rng(11)
     tracker = BodyTracker(trial.rig, trial.bodies)
@@ -219,7 +219,7 @@ def test_stamps_of_arrival_lose_no_body():
 
 
 def test_errors_that_stay_are_not_smoothed_away():
-    """The correction is the same error in all exposures, however many there are."""
+    """The error of the correction is the same in all exposures, however many there are."""
     rng = np.random.default_rng(6)
     rig = orientation()
     given = body(rng, 4)
@@ -256,7 +256,7 @@ def test_butterworth_propagates_deviations_and_refuses_what_it_cannot_do():
 
 
 def test_predictions_do_not_change_what_an_exposure_says():
-    """Asked for twice, for another time, and before better shapes are taken."""
+    """Predictions are requested twice, for another time, and before better shapes are used."""
     trial = Trial(count=12)
     plain, asked = (BodyTracker(trial.rig, trial.bodies, lag=0) for _ in range(2))
     shift = np.array([3.0, -2.0, 1.0])

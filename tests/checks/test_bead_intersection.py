@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Beads from the images alone are those of an independent least-squares solver."""
+"""Beads from the images alone agree with those of an independent least-squares solver."""
 
 from types import SimpleNamespace as Fake
 
@@ -19,7 +19,7 @@ from fluoro_calib_ros.photogrammetry.rotations import (
 )
 
 COUNT = 12
-FALSE = 3  # a bead with one false match
+FALSE = 3  # bead with one false match
 MOSTLY_FALSE, SELDOM = 5, 7  # beads that cannot be intersected
 NOISE_PX, CORRECTION_SD_PX, SHIFT_PX = 0.3, 0.4, np.array([3.0, -2.0])
 VARIANCE = NOISE_PX**2 + CORRECTION_SD_PX**2
@@ -73,14 +73,14 @@ def scene():
         noise_sd=lambda frame: np.full(len(frame.target_id), NOISE_PX),
     )
     start = np.vstack([[[900.0, 900, 900]], xyz + rng.normal(0, 0.5, xyz.shape)])
-    targets = Fake(target_id=np.append(7, ids), xyz_mm=start)  # one that is not seen
+    targets = Fake(target_id=np.append(7, ids), xyz_mm=start)  # bead 7 is not seen
     job = Fake(fluoroscopes=figures, calibrations={'a': calibration, 'b': calibration})
     job.targets = targets
     return job, frames, phantom, rays
 
 
 def solved(rays, start):
-    """Point (3,), its covariance and the residuals over their sd, by scipy."""
+    """Point (3,), its covariance, and the residuals over their sd, by scipy."""
 
     def misfit(point):
         return np.concatenate(

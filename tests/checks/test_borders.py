@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""On which side of a limit a value lies that is just at it; sums spelt out on a few numbers."""
+"""Values just at a limit lie on its correct side; sums are spelt out on a few numbers."""
 
 from dataclasses import replace
 from types import SimpleNamespace as Fake
@@ -83,7 +83,7 @@ def test_residuals_just_as_large_as_is_plausible_are():
     [(12_345.0, 10_000.0), (1.7, 2.0), (0.0123, 0.01), (260.0, 300.0), (0.0, 0.0), (None, None)],
 )
 def test_distance_of_the_source_is_told_by_its_first_digit(monkeypatch, distance, rounded):
-    """So that all exposures have one finding."""
+    """Rounding makes all exposures have the same finding."""
     monkeypatch.setattr(inputs, 'wrong_unit', lambda mm, phantom: (mm, phantom))
     found = inputs._unit_cause('phantom', inputs.Fit(1.0, False, distance))
     assert found == (None if rounded is None else (pytest.approx(rounded), 'phantom'))
@@ -167,14 +167,14 @@ def test_ten_beads_are_enough_for_a_comparison_with_their_survey():
     off = replace(beads, xyz_mm=xyz + (np.arange(10) == 4)[:, None] * [0.0, 20, 0])
     first, second = compare_with_survey(off)
     assert first.passed is False and first.place.target_id == (4,)
-    assert second.passed is None and second.kind is Kind.DISTANCES  # nine are left
+    assert second.passed is None and second.kind is Kind.DISTANCES  # nine distances remain
 
 
 # ---- the rig and its drift
 
 
 def test_motion_is_that_of_the_first_fluoroscope_between_its_stamps():
-    """The second one sees the phantom move twice as fast."""
+    """The second fluoroscope sees the phantom move twice as fast."""
 
     def stamped(number, stamp, speed):
         uv = np.arange(20.0).reshape(10, 2) + [speed * number, 0]
@@ -207,11 +207,11 @@ def test_what_an_alarm_adds_to_image_points_is_the_excess_of_their_variance(monk
     monkeypatch.setattr(
         rig_change, '_weights', lambda *given: asked.append(given) or (3.0, np.ones(len(given[1])))
     )
-    # Noise and twice what is systematic: 2.5, 5 and 9.
+    # Noise plus twice the systematic part: 2.5, 5 and 9.
     assert change.addition(2).image_sd == pytest.approx(np.sqrt(2 * 5.0))
     assert change.addition(1).image_sd == pytest.approx(np.sqrt(2 * 3.0))
     for design, residual, _ in asked:
-        # The derivatives by unknowns of variance one: four times all causes together.
+        # Derivatives with respect to unknowns of unit variance: four times all causes together.
         np.testing.assert_allclose(design, np.tile([8.0, 12.0], (len(residual), 1)))
     assert asked[-1][2].tolist() == [1.5, 3.0, 9.0]
     monkeypatch.setattr(rig_change, '_weights', lambda *given: (1.0, np.ones(len(given[1]))))
@@ -242,7 +242,7 @@ def test_an_area_is_tested_with_so_many_different_markers(markers, enough):
 
 
 def test_noise_that_lasts_is_seen_in_the_residuals_of_each_marker():
-    """By marker, in the order of frames, and over the noise that is stated."""
+    """Per marker, in the order of frames, relative to the stated noise."""
     rng = np.random.default_rng(3)
     noise = np.zeros((3, 3000))
     for k in range(1, 3000):
@@ -259,7 +259,7 @@ def test_noise_that_lasts_is_seen_in_the_residuals_of_each_marker():
 
 
 def test_a_block_without_information_is_passed_over():
-    """The next difference is from the last block that had any."""
+    """The next difference refers to the last block with information."""
     charts = CusumCharts(1, 1, 0.1, 30.0)
     one, yes = np.ones((1, 1)), np.ones((1, 1), bool)
     for score, information in ((0.0, 1.0), (0.0, 0.0), (4.0, 1.0)):
@@ -267,7 +267,7 @@ def test_a_block_without_information_is_passed_over():
     assert charts.variance_factor()[0, 0] == pytest.approx(1.25 * (20 * 4.5 + 8) / 21)
 
 
-# ---- more of input
+# ---- more on input
 
 
 def phantom_of(count=30):
@@ -321,9 +321,9 @@ def test_image_points_that_reach_to_the_limit_are_of_the_right_size(reach, is_wr
 @pytest.mark.parametrize(
     ('count', 'rejected', 'doubted'),
     [
-        (600, 300, False),  # half of them: no more than others may have
+        (600, 300, False),  # half of them: not more than allowed
         (600, 301, True),
-        (6, 4, False),  # by chance, as one of so many beads
+        (6, 4, False),  # may happen by chance to one of so many beads
         (7, 6, True),
     ],
 )
@@ -347,7 +347,7 @@ def test_layers_begin_also_where_no_gap_is_among_the_largest():
     assert regular[-2] in found
 
 
-# ---- comparison, and held out
+# ---- comparison, and held-out exposures
 
 
 def test_a_place_is_told_in_words_and_numbers():
@@ -357,7 +357,7 @@ def test_a_place_is_told_in_words_and_numbers():
 
 @pytest.mark.parametrize('which', [(), ('first',), ('second',)])
 def test_an_interior_that_was_fixed_is_compared_as_it_is(which):
-    """In one gauge only where both are estimated."""
+    """A common gauge is used only if both are estimated."""
     one = rigs.pincushion('a', (400, 300))
     made = {
         name: replace(
@@ -380,7 +380,7 @@ def test_an_interior_that_was_fixed_is_compared_as_it_is(which):
 
 
 def test_sums_of_an_exposure_held_out_are_of_what_its_noise_leaves(monkeypatch):
-    """Image points that are said to be twice as noisy count as a quarter."""
+    """Image points with twice the stated noise count a quarter."""
     rng = np.random.default_rng(5)
     n = 40
     exposure = np.repeat([0, 1], n // 2)
@@ -514,7 +514,7 @@ def test_a_layer_and_the_rest_have_eight_beads_each(count, is_found):
 
 
 def test_a_layer_explains_at_least_half_of_what_is_wrong():
-    """Not where single beads are wrong by much more."""
+    """Single beads that are wrong by much more prevent a finding."""
     rng = np.random.default_rng(4)
     survey = rng.uniform(-50, 50, (60, 3))
     survey[:, 2] = np.where(np.arange(60) < 25, -60.0, 60.0)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers of checks on small inputs whose answers are known."""
+"""Numbers of checks on small inputs with known answers."""
 
 import warnings
 from dataclasses import replace
@@ -122,7 +122,7 @@ def test_copied_exposures_are_named_with_their_originals():
 def test_shared_exposures_are_of_both_fluoroscopes():
     one, other = [frame(n) for n in (1, 2, 3)], [frame(n) for n in (1, 2, 3)]
     other[2] = replace(one[1], number=3)
-    other.append(replace(other[0], number=8))  # a copy in one of them is another matter
+    other.append(replace(other[0], number=8))  # a copy in only one is a different case
     assert [(a.number, b.number) for a, b in shared_exposures(one, other)] == [(2, 3)]
     assert [(a.number, b.number) for a, b in shared_exposures(other, one)] == [(3, 2)]
 
@@ -179,7 +179,7 @@ def test_repeated_and_remote_targets_are_found_by_their_places():
     unseen = [frame(ids=ids[10:], uv=np.zeros((30, 2)))]
     assert find_wrong_phantom({'a': unseen}, phantom) == []
     with warnings.catch_warnings():
-        warnings.simplefilter('error')  # no mean of nothing
+        warnings.simplefilter('error')  # no mean of an empty array
         assert find_wrong_phantom({'a': [frame(ids=[1], uv=[[0, 0]])]}, phantom) == []
 
 
@@ -230,7 +230,7 @@ def test_impossible_results_are_found_at_their_limits(changes, kind):
 
 
 def test_targets_on_a_line_are_not_looked_at_for_wrong_coordinates():
-    """Wherever the line is: a calibration says more about it."""
+    """The direction of the line does not matter; a calibration reveals more about it."""
     along = np.append(np.arange(30.0), 1e5)[:, None]
     frames = {'a': [Fake(target_id=np.arange(31))]}
     for direction in ([1.0, 2, 3], [1.0, 0, 0]):
@@ -278,7 +278,7 @@ def test_residuals_may_be_as_large_as_their_sigma_says():
     ],
 )
 def test_principal_point_is_within_an_image_of_the_middle(offset, about_middle, is_off):
-    """In its own gauge, or in that of a correction about the middle of the image."""
+    """In its own gauge, or in that of a correction about the image centre."""
     own, other = (np.array([511.5 + each, 383.5, 4000.0]) for each in (offset, about_middle))
     found = found_in(figures(interior=own), calibration(interior=other))
     assert kinds(found) == ([Kind.PRINCIPAL_POINT_OFF] if is_off else [])
@@ -350,7 +350,7 @@ def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise)
 
 
 def trends_of(monkeypatch, change=None, rejected=None, model_name='auto', corrects=True):
-    """Checks of whiteness, worst area and drift of an image of 1000 x 500 px."""
+    """Checks of whiteness, worst area and drift for an image of 1000 x 500 px."""
     trend = Fake(size=0.2, place=np.array([300.0, 40.0]), cell_size=0.5, cell_limit=0.3)
     common = Fake(
         trend=trend,
@@ -645,8 +645,8 @@ def test_distances_of_three_beads_have_their_rms_and_expectation():
 def test_beads_of_which_most_points_are_rejected_are_named():
     target = np.repeat(np.arange(10), 12)
     outlier = np.zeros(120, bool)
-    outlier[12:24] = True  # all of bead 1
-    outlier[24:30] = True  # half of bead 2
+    outlier[12:24] = True  # all points of bead 1
+    outlier[24:30] = True  # half of the points of bead 2
     outlier[36] = True
     exposure = np.arange(120) % 12
     name = np.full(120, 'a')
@@ -662,7 +662,7 @@ def test_layers_are_between_the_largest_gaps():
     found = {tuple(pair) for pair in _layers(coordinate, np.full(40, 0.1)).tolist()}
     assert {(0, 12), (12, 20), (20, 40), (0, 20)} <= found
     assert all(stop - start <= 20 for start, stop in found)
-    # The survey does not tell beads of less than 13 mm apart: only the last gap is a border.
+    # The survey does not resolve gaps of less than 13 mm, so only the last gap is a border.
     vague = _layers(coordinate, np.full(40, 13 / 18**0.5)).tolist()
     assert vague == [[0, 20], [20, 40]]
     sums = _sums(np.arange(1.0, 6.0), np.array([0, 2]), np.array([2, 5]))
@@ -770,7 +770,7 @@ def test_exposures_are_examined_at_a_rate_and_after_a_restart(last, now, due):
 
 
 def test_the_watch_tells_noise_from_what_is_common_to_exposures():
-    """What the corrections claim is not noise; rays that are far apart are no evidence."""
+    """Claimed correction errors are not noise; rays that are far apart are no evidence."""
     told = []
     watch = RigDriftWatch.__new__(RigDriftWatch)
     watch._addition, watch._has_bodies, watch._names = None, False, ('a', 'b')
@@ -794,7 +794,7 @@ def test_the_watch_tells_noise_from_what_is_common_to_exposures():
     exposure = Fake(target_id=np.arange(4) + 7, views=views)
     assert watch.add_exposure(55, exposure) == 'fine' and watch._last_ns == 55
     noise, (stamp, a, b, given) = told
-    # Of b, nothing is left.
+    # Only the noise of a remains, that of b is all correction.
     np.testing.assert_allclose(noise, 0.5**2 * (0.5**2 - 0.4**2))
     assert (stamp, a, b) == (55, 'a', 'b') and given.target_id.tolist() == [7, 8, 9]
     np.testing.assert_allclose(given.sd_noise**2 + given.sd_systematic**2, 0.6**2)
@@ -899,7 +899,7 @@ def test_variance_of_blocks_is_that_of_their_differences():
     yes = np.ones((1, 2), bool)
     for value in (0.0, 4.0):
         charts.update(np.array([[value, 0]]), np.ones((1, 2)), np.zeros((1, 2)), yes, 1)
-    # 16 / 2, and 0; pooled with one that is as predicted
+    # 16 / 2, and 0; pooled with a variance as predicted
     pooled = (1 + 8) / 3
     expected = 1.25 * np.array([(20 * pooled + 8) / 21, 20 * pooled / 21])
     np.testing.assert_allclose(charts.variance_factor()[0], expected)
@@ -991,7 +991,7 @@ def test_residuals_are_clipped_at_noise_band_and_tolerance(sign):
 
 
 def test_stretch_is_that_of_noise_that_lasts():
-    """1 for white noise, more for an autoregression, by differences over its lags."""
+    """1 for white noise, more for an autoregression, from differences over its lags."""
     rng = np.random.default_rng(1)
     white = rng.normal(size=8000)
     lasting = np.zeros(8000)
@@ -1034,7 +1034,7 @@ def test_levels_begin_at_their_thresholds():
 def test_cause_of_an_exposure_is_that_of_its_fit(
     monkeypatch, misfit, is_behind, distance_mm, relabelled, kind
 ):
-    """Misfits over the side of the image; those of other ids where they are relabelled."""
+    """Misfits are relative to the image side; `relabelled` is the misfit with shifted ids."""
     fits = iter(
         [
             Fake(misfit_px=1000 * misfit, is_behind=is_behind, distance_mm=distance_mm),

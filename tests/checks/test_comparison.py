@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What changed between two calibrations of a fluoroscope."""
+"""Changes between two calibrations of a fluoroscope."""
 
 import functools
 import json
@@ -31,7 +31,7 @@ def calibration(seed, bump=0.0, gauge=0.0):
 
     bump [px]: a local change of the image; gauge: a scale that belongs to the principal distance.
     """
-    return _calibration(seed, bump, gauge)  # a cache tells a default from the same value
+    return _calibration(seed, bump, gauge)  # a cache keeps defaults apart from equal values
 
 
 @functools.cache
@@ -55,7 +55,7 @@ def test_calibration_does_not_differ_from_itself():
 
 @pytest.mark.parametrize('seed', [2, 3, 4])
 def test_noise_is_no_change(seed):
-    """Other training points of the same distortion, also with another principal distance."""
+    """Different training points of the same distortion, also with another principal distance."""
     for gauge in (0.0, 5.0):
         found = compare_calibrations(calibration(1), calibration(seed, gauge=gauge))
         assert not found.field_changed, found.significant.mean()
@@ -82,7 +82,7 @@ def test_change_of_the_interior_orientation_is_told():
 
 @functools.cache
 def turned(seed, rad=0.01, gauge=0.0):
-    """The same rays from a sensor that is turned, with its principal point elsewhere."""
+    """The same rays from a rotated sensor, with its principal point elsewhere."""
     one = calibration(seed, gauge=gauge)
     interior = one.interior + [rad * one.interior[2], 0, 0]
     uv = one.model.train_uv
@@ -96,7 +96,7 @@ def turned(seed, rad=0.01, gauge=0.0):
 
 
 def test_interior_orientations_in_other_gauges_are_the_same():
-    """The principal point moves by 40 px where the sensor turns by 10 mrad."""
+    """The principal point moves by 40 px when the sensor rotates by 10 mrad."""
     for other in (turned(1), turned(2)):
         found = compare_calibrations(calibration(1), other)
         assert abs(other.interior[0] - calibration(1).interior[0]) > 30
@@ -105,7 +105,7 @@ def test_interior_orientations_in_other_gauges_are_the_same():
 
 
 def test_interior_orientations_in_gauges_about_far_principal_points_are_the_same():
-    """Two recordings of a strong distortion may have sensors that are turned by 8 degrees."""
+    """Two recordings of a strong distortion may yield sensors rotated by 8 degrees."""
     one, other = turned(1, -0.14, gauge=30.0), turned(2, 0.14, gauge=30.0)
     assert abs(other.interior[0] - one.interior[0]) > 800
     found = compare_calibrations(one, other)
@@ -119,7 +119,7 @@ def test_other_image_sizes_are_not_compared():
 
 
 def test_compare_tells_what_changed(tmp_path, capsys):
-    """In px and mm, with a picture; folders without calibrations are refused."""
+    """Changes are in px and mm, with a picture; folders without calibrations are refused."""
     for name, one in (('one', calibration(1)), ('other', calibration(2, bump=1.5))):
         save_result(tmp_path / name, replace(base(), calibrations={'a': one}))
     figure = tmp_path / 'changes.png'

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recordings that do not belong together, or to the calibrations that are held.
+"""Recordings that do not belong together, or not to the fixed calibrations.
 
-The rig has no distortion and its calibrations are the truth, so whatever is found is the fault of
-the input. What is right must pass without a word.
+The rig has no distortion and its calibrations are exact, so every finding is the fault of the
+input. Correct input must pass without a message.
 """
 
 import functools
@@ -66,13 +66,13 @@ def rig():
 
 @functools.cache
 def calibrations():
-    """Its true calibrations."""
+    """True calibrations of the rig."""
     return true_calibrations(rig().fluoroscopes)
 
 
 @functools.cache
 def orientation():
-    """Its true orientation, with a small covariance."""
+    """True orientation of the rig, with a small covariance."""
     return true_orientation(rig().fluoroscopes, calibrations())
 
 
@@ -84,7 +84,7 @@ def poses():
 def seen(of_rig, of_b=None):
     """Frames of half of the beads that are seen.
 
-    of_b(k, fluoroscope, pose) returns what b and the phantom do.
+    of_b(k, fluoroscope, pose) returns fluoroscope b and the pose that it sees.
     """
     rng = np.random.default_rng(6)
     out = {f.name: [] for f in of_rig.fluoroscopes}
@@ -105,13 +105,13 @@ def frames():
 
 
 def scatter(of_frames):
-    """Whether exposures give an orientation, and what is doubtful about it."""
+    """Whether exposures give an orientation, and findings that make it doubtful."""
     _, (pairs,) = orientation_and_scatter(of_frames, rig().phantom, calibrations())
     return doubtful(pairs, SIZE, 0.3)
 
 
 def nudged(mm, rad, first, last=COUNT):
-    """B sees the phantom moved in a random way in some exposures."""
+    """Make b see the phantom moved at random in some exposures."""
     rng = np.random.default_rng(7)
 
     def change(k, fluoroscope, pose):
@@ -123,7 +123,7 @@ def nudged(mm, rad, first, last=COUNT):
 
 
 def rig_moved(mm, rad, first):
-    """B is moved once."""
+    """Move b once, before exposure index `first`."""
 
     def change(k, fluoroscope, pose):
         if k < first:
@@ -143,7 +143,7 @@ def test_exposures_of_a_rigid_rig_agree():
 
 
 def of_rig(of_frames):
-    """What the exposures say about the orientation, and the check of it."""
+    """Findings of the exposures on the orientation, and the check of it."""
     request = CalibrationRequest(of_frames, rig().phantom)
     result = adjust(of_frames, rig().phantom, calibrations())
     found = rig_findings(request, result, of_frames, calibrations())
@@ -151,7 +151,7 @@ def of_rig(of_frames):
 
 
 def test_the_check_of_the_orientation_passes_on_a_rigid_rig():
-    """What no exposure can show, synchronous frames without stamps, is a note beside it."""
+    """Synchronism cannot be verified without stamps, which is noted in addition."""
     found, check = of_rig(frames())
     assert check.kind is Kind.ORIENTATION and check.passed
     assert found.orientation is not None and check.numbers['ratio'] < 2
@@ -160,7 +160,7 @@ def test_the_check_of_the_orientation_passes_on_a_rigid_rig():
 
 
 def test_frames_of_b_that_are_late_while_the_phantom_moves_fail_the_check():
-    """By one frame: about 1.5 mm and 0.3 degrees."""
+    """They are late by one frame: about 1.5 mm and 0.3 degrees."""
     _, check = of_rig(seen(rig(), nudged(0.9, 0.003, 0)))
     assert check.passed is False and check.numbers['ratio'] > 5
     assert check.value > check.limit >= calibrations()['a'].image_sd
@@ -183,7 +183,7 @@ def test_frames_of_other_exposures_fail_and_frames_without_partner_cannot_tell()
 
 
 def test_two_beads_exchanged_in_the_survey_are_named():
-    """By the exposures of one fluoroscope, and the message says which."""
+    """Exposures of one fluoroscope suffice, and the message names the beads."""
     phantom = rig().phantom
     distance = squareform(pdist(phantom.xyz_mm))
     seen_ids = np.concatenate([frame.target_id for frame in frames()['a']])
@@ -207,7 +207,7 @@ def test_two_beads_exchanged_in_the_survey_are_named():
 
 @pytest.mark.parametrize('late, trusted', [(0.0, 0), (0.2, 1)])
 def test_stamps_say_whether_frames_are_of_one_exposure(late, trusted):
-    """Late by a part of the time between exposures in which the image moves far."""
+    """Frames are late by a part of the exposure interval in which the image moves far."""
     stamped = {
         name: [
             replace(frame, stamp_ns=int(1e9 * (frame.number + late * (name == 'b'))))
@@ -253,7 +253,7 @@ def test_a_phantom_that_moves_between_the_fluoroscopes_gives_no_orientation():
 
 
 def on_an_arm(of_frames, order=range(COUNT)):
-    """The frames of a C-arm whose image b shifts with the angle, as orientations express it."""
+    """Frames of a C-arm whose image b shifts with the angle, as orientations express it."""
     angles = np.linspace(-1.4, 1.4, COUNT)[list(order)]
 
     def at(frame):
@@ -270,7 +270,7 @@ MIXED = (3, 6, 0, 5, 1, 7, 2, 4)
 
 
 def scatter_on_an_arm(of_b=None, order=MIXED, changes=True):
-    """As scatter; changes: whether the calibrations know of a change with the angle."""
+    """As scatter(). changes: whether the calibrations contain a change with the angle."""
     held = calibrations()
     if changes:
         held = {name: turning(c, 90.0, 0.0) for name, c in held.items()}
@@ -316,7 +316,7 @@ def exchanged(of_frames):
 
 
 def changed(change, names='ab'):
-    """The frames of some fluoroscopes changed."""
+    """Change the frames of some fluoroscopes."""
     return {n: [change(f) if n in names else f for f in of] for n, of in frames().items()}
 
 
@@ -388,14 +388,14 @@ def test_shift_that_is_found_is_the_one_that_was_made(field, step):
 
 
 def test_share_of_rejected_points_is_of_points_of_two_views():
-    """A single view has no second ray, and a point that failed is as bad as a rejected one."""
+    """Single views have no second ray and do not count; failed points count as rejected."""
     status = np.array([OK] * 3 + [OUTSIDE] + [REJECTED] * 2 + [FAILED] * 4 + [SINGLE_VIEW] * 7)
     found = [SimpleNamespace(points=SimpleNamespace(status=part)) for part in (status, status[:4])]
     assert share_rejected(found) == (6 / 14, 14)
     assert share_rejected([]) == (0.0, 0)
     misses = RecentMisses()
     misses.add(SimpleNamespace(status=status))
-    assert misses.finding() is None  # 10 points are few
+    assert misses.finding() is None  # 10 points are too few
     misses.add(SimpleNamespace(status=status))
     assert misses.finding().numbers['share'] == 0.6
     alone = RecentMisses()
@@ -416,11 +416,11 @@ def test_some_false_matches_do_not_refuse_a_reconstruction():
 
 @functools.cache
 def distorted():
-    """Calibrations with a distortion, and frames that have it."""
+    """Calibrations with a distortion, and frames that are distorted by it."""
     held = {}
     seen_so = {}
     for name in 'ab':
-        # Its lookup grid, which each command makes again, takes a twentieth of another model's.
+        # Each command rebuilds the lookup grid, which takes this model a twentieth of the time.
         result = calibrated(name, 6, max_iterations=2, model='collocation')
         calibration = result.calibrations[name]
         held[name] = replace(
@@ -566,12 +566,12 @@ def test_a_file_of_corrected_points_says_so(tmp_path, capsys):
         capsys.readouterr()
         assert run(*command) == 1
         assert 'are corrected already' in capsys.readouterr().err
-    # As they are, they can be converted on.
+    # Uncorrected output can still be converted.
     assert run('convert', corrected, *with_held, '--to', 'xmalab2d', *out) == 0
 
 
 def wrong_distance(factor):
-    """Calibrations with another principal distance."""
+    """Calibrations with a different principal distance."""
     return {
         name: replace(c, interior=c.interior * [1, 1, factor])
         for name, c in calibrations().items()
@@ -607,7 +607,7 @@ def test_what_is_doubtful_about_the_rig_stays_with_the_result(
     change, sentence, verdict, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(html_report, 'svg_text', lambda figure: '')
-    if change:  # a good rig passes every check; here those of the rig matter
+    if change:  # a good rig passes every check; of a bad one, those of the rig matter
         monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     write_phantom(tmp_path / 'phantom.csv', rig().phantom)
     source = tmp_path / 'observations.csv'
@@ -630,7 +630,7 @@ def test_what_is_doubtful_about_the_rig_stays_with_the_result(
         page = (out / 'report.html').read_text()
         assert ('<p>Note: ' in page) == bool(note)
         assert run('report', out) == 0
-    # A capture orients the rig whatever the exposures say.
+    # A capture gives an orientation whatever the exposures show.
     arguments = ('--calibration', out, '--phantom', tmp_path / 'phantom.csv', '--exposures', '1')
     assert run('orient', source, *arguments) == 0
     assert run('validate', out) == 0
@@ -655,5 +655,5 @@ def test_the_commands_say_what_is_wrong(tmp_path, capsys):
     arguments = ('--exposures', '1')
     assert run('orient', source, *held, *phantom, *arguments) == 0
     said = capsys.readouterr().err
-    # The phantom of exposure 1 is another frame, but the fluoroscopes stand as before.
+    # The phantom of exposure 1 defines another frame, but the fluoroscopes have not moved.
     assert 'stand otherwise' not in said and 'doubtful' not in said

@@ -55,14 +55,14 @@ SIZES = {'a': (1024, 1024), 'b': (1024, 1024)}
 NORMAL = np.array([0.0, 1.0])
 FACTOR = np.sqrt(0.5)
 SYSTEMATIC_PX = 0.05
-# One false alarm in 10 minutes, in long blocks, so that hours pass in seconds.
+# One false alarm in 10 minutes and long blocks, so that hours are simulated in seconds.
 OFTEN = DriftOptions(
     error_interval_h=1 / 6, warn_interval_h=1 / 6, cells=2, block_s=1.0, learn_s=30.0
 )
 
 
 def moving(rng, count, seconds, rate_hz):
-    """Pixels (T, count, 2) of markers in both images: v is the same, as with horizontal epipolar
+    """Pixels (T, count, 2) of markers in both images; v is equal, as with horizontal epipolar
     lines.
     """
     t = np.arange(int(seconds * rate_hz)) / rate_hz
@@ -78,7 +78,7 @@ def moving(rng, count, seconds, rate_hz):
 
 
 def autoregressive(rng, shape, correlation):
-    """Noise (T, n) of variance 1 with a given correlation of successive rows."""
+    """Noise (T, n) of variance 1 with a given correlation between successive rows."""
     noise = rng.normal(size=shape)
     for k in range(1, len(noise) if correlation else 0):
         noise[k] = correlation * noise[k - 1] + np.sqrt(1 - correlation**2) * noise[k]
@@ -86,7 +86,7 @@ def autoregressive(rng, shape, correlation):
 
 
 def residuals(ids, uv_a, uv_b, residual, systematic=SYSTEMATIC_PX):
-    """EpipolarObservations with residuals (n,) of ids (n,)."""
+    """EpipolarObservations with residuals (n,) of markers with ids (n,)."""
     n = len(ids)
     normal = np.broadcast_to(NORMAL, (n, 2))
     factor = np.full(n, FACTOR)
@@ -105,15 +105,15 @@ def residuals(ids, uv_a, uv_b, residual, systematic=SYSTEMATIC_PX):
 
 
 def add_residuals(watch, stamp_s, ids, uv_a, uv_b, residual, pair=('a', 'b')):
-    """State after residuals (n,) at one stamp."""
+    """State after adding residuals (n,) at one stamp."""
     return watch.add_residuals(round(stamp_s * 1e9), *pair, residuals(ids, uv_a, uv_b, residual))
 
 
 def state_after(
     watch, seconds, residual_of, seed=0, count=12, rate_hz=24, start_s=0.0, noise=0.25, each=None
 ):
-    """State after a stream in frames of count markers: residual_of(t, uv_a, uv_b) [px], and noise
-    [px] added.
+    """State after a stream of frames with count markers. residual_of(t, uv_a, uv_b) [px] is the
+    residual to which noise [px] is added.
     """
     rng = np.random.default_rng(seed)
     uv_a, uv_b = moving(rng, count, seconds, rate_hz)
@@ -129,7 +129,7 @@ def state_after(
 
 
 def quarter_of(side, size, begin_s=0.0, quarter='upper left'):
-    """residual_of of a drift [px] down, over a quarter of image number side."""
+    """residual_of for a drift [px] downwards in a quarter of image number side."""
     column, row = QUARTERS[quarter]
 
     def residual(t, a, b):
@@ -150,7 +150,7 @@ def quarter_of(side, size, begin_s=0.0, quarter='upper left'):
 
 @pytest.mark.parametrize('correlation', [0.0, 0.5])
 def test_mean_time_to_a_false_alarm_of_a_chart_is_at_least_the_bound(correlation):
-    """400 charts with the mean at the edge of their dead band, and more noise than predicted."""
+    """400 charts, mean at the edge of their dead band, noise larger than predicted."""
     rng = np.random.default_rng(1)
     threshold = 6.0
     series = 400
@@ -168,7 +168,7 @@ def test_mean_time_to_a_false_alarm_of_a_chart_is_at_least_the_bound(correlation
         )
         charts.stretch[:] = (1 + correlation) / (
             1 - correlation
-        ) ** 2  # that of blocks, told by PairWatch otherwise
+        ) ** 2  # for blocks; PairWatch usually estimates it
         charts.update(
             mean[:, None] * information,
             information,
@@ -188,8 +188,8 @@ def test_mean_time_to_a_false_alarm_of_a_chart_is_at_least_the_bound(correlation
 def test_stated_rate_of_false_alarms_holds_with_correlated_noise_and_false_matches(
     seed,
 ):
-    """36 minutes: means at both edges, noise 1.3 times the predicted one, correlation 0.5, 2 % of
-    false matches.
+    """36 minutes: means at both edges of the band, noise 1.3 times the predicted one, correlation
+    0.5, 2 % false matches.
     """
     rng = np.random.default_rng(seed)
     rate = 24
@@ -199,7 +199,7 @@ def test_stated_rate_of_false_alarms_holds_with_correlated_noise_and_false_match
     n = 24
     alarms = 0
     uv_a, uv_b = moving(rng, count, hours * 3600, rate)
-    edge = FACTOR * OFTEN.tolerance_px  # against the start; against the calibration it is in total
+    edge = FACTOR * OFTEN.tolerance_px  # against the start; `total` is against the calibration
     total = FACTOR * np.hypot(OFTEN.tolerance_px, OFTEN.band_calibration * SYSTEMATIC_PX / FACTOR)
     residual = 0.25 * 1.3 * autoregressive(rng, uv_a.shape[:2], 0.5) + total - edge
     residual[int((OFTEN.learn_s + 0.5) * rate) :] += edge
@@ -215,11 +215,11 @@ def test_stated_rate_of_false_alarms_holds_with_correlated_noise_and_false_match
             uv_b[k : k + n].reshape(-1, 2),
             residual[k : k + n].ravel(),
         )
-        if state.level != OK:  # from the start again, but with what is known of means and noise
+        if state.level != OK:  # restart, but keep the learned means and noise
             alarms += 1
             watch._epipolar.charts.evidence[:] = 0
             watch._level = OK
-    assert alarms <= 6 * hours  # stated: 6 an hour on average
+    assert alarms <= 6 * hours  # the stated rate is 6 an hour on average
 
 
 def test_correlated_noise_raises_the_variance():
@@ -241,7 +241,7 @@ def test_correlated_noise_raises_the_variance():
 
 
 def test_systematic_errors_within_the_stated_precision_are_no_drift():
-    def residual(t, a, b):  # 2.5 standard deviations, another in every place
+    def residual(t, a, b):  # 2.5 standard deviations, varying over the image
         return 2.5 * SYSTEMATIC_PX * np.sin(a[:, 0] / 90) * np.cos(b[:, 0] / 120 + a[:, 1] / 100)
 
     largest = []
@@ -332,7 +332,7 @@ def test_drift_before_the_start_is_compared_with_the_calibration():
 
 
 def test_less_precise_calibration_has_a_wider_dead_band():
-    """The same step of 0.35 px against the calibration is a drift at 0.05 px, none at 0.2 px."""
+    """A step of 0.35 px against the calibration is a drift at 0.05 px, but none at 0.2 px."""
     found = []
     for systematic in (0.05, 0.2):
         watch = DriftWatch(SIZES)
@@ -373,7 +373,7 @@ def test_alarm_ends_with_the_drift_and_with_a_reset():
     assert state.level == OK and state.evidence < 0.5 * state.threshold_warn
 
 
-# ---- odd input
+# ---- unusual input
 
 
 def test_nan_empty_late_and_earlier_frames_are_accepted():
@@ -387,7 +387,7 @@ def test_nan_empty_late_and_earlier_frames_are_accepted():
         a = np.where(rng.random((12, 1)) < 0.05, np.nan, a)
         late = (
             k / 24 - 0.3 * (k % 5 == 0) - 1000 * (k > 500)
-        )  # late frames, and a recording that begins anew
+        )  # late frames, and a recording that starts again
         state = add_residuals(watch, late, np.arange(12), a, b, residual)
         state = add_residuals(watch, late, np.zeros(0, dtype=int), nothing, nothing, np.zeros(0))
     assert state.level == ERROR and state.fluoroscope == 'a' and 0 <= state.since_s < 14
@@ -414,7 +414,7 @@ def test_pairs_in_either_order_and_three_fluoroscopes():
     uv_a, uv_b = moving(rng, 15, 24, 24)
     for k, (a, b) in enumerate(zip(uv_a, uv_b)):
         c = b * (800 / 1024, 600 / 1024)
-        drift = quarter_of(0, 0.6, 16)(k / 24, b, a)  # of b
+        drift = quarter_of(0, 0.6, 16)(k / 24, b, a)  # drift of b
         state = add_residuals(
             watch, k / 24, np.arange(15), b, a, drift + rng.normal(0, 0.25, 15), ('b', 'a')
         )
@@ -501,7 +501,7 @@ def test_field_of_systematic_errors_is_estimated():
 
 
 class Known:
-    """A calibration that corrects to within 0.04 px."""
+    """Stand-in for a calibration that corrects to within 0.04 px."""
 
     image_sd = 0.25
 
@@ -566,7 +566,7 @@ def test_clusters_see_a_drift_along_the_epipolar_lines(name, quarter, direction)
 
 
 def test_undetectable_drift_is_not_reported():
-    """A shift of a whole image along the epipolar lines moves all points alike."""
+    """Shifting a whole image along the epipolar lines moves all points alike."""
     scene, watch, first = perfect()
     for size in (0.5, 0.0):
         found = detection(
@@ -628,7 +628,7 @@ def test_shapes_can_be_declared():
 
 
 def test_score_of_a_body_is_the_most_likely_drift():
-    """By score over information, against a shift that is known; with two beads, too."""
+    """Score over information equals a known shift, also with two beads."""
     scene, _, first = perfect()
     beads = np.random.default_rng(16).uniform(-22, 22, (5, BEADS, 3))
     areas = ImageAreas(4)
@@ -683,9 +683,9 @@ def test_invalid_watches_are_refused():
 
 @pytest.mark.parametrize('length_s, watched_s', [(0.5, 5), (3.0, 40)])
 def test_bag_in_a_loop_is_watched_as_one_stream(length_s, watched_s):
-    """Blocks end although the stamps never go beyond the bag, and exposures do not pile up.
+    """Blocks end although the stamps never exceed those of the bag, and exposures do not pile up.
 
-    Of a bag of less than a second the begin of a turn is only noticed after 100 exposures.
+    In a bag of less than a second, a restart is noticed only after 100 exposures.
     """
     options = DriftOptions(cells=2, block_s=1.0, learn_s=5.0)
     watch = DriftWatch(SIZES, options)

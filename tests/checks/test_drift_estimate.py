@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the newest blocks say of a drift: weighted means, in closed form."""
+"""Drift estimated from the newest blocks: weighted means, in closed form."""
 
 from types import SimpleNamespace
 
@@ -11,14 +11,14 @@ import pytest
 from fluoro_calib_ros.checks.drift_evidence import BlockRecord, EpipolarEvidence
 
 AREAS = 3
-BEGIN, COUNT = 4, 10  # block from which the drift is there, and number of blocks
+BEGIN, COUNT = 4, 10  # first block with the drift, and number of blocks
 RNG = np.random.default_rng(5)
 INFORMATION = RNG.uniform(50, 150, (COUNT, 4, AREAS))
 SYSTEMATIC = RNG.uniform(0.01, 0.05, (COUNT, 4, AREAS))
 
 
 def estimate(series, area, size, factor=1.0, both=False):
-    """Of a drift in one series of the pair a, b; both: in those of a and of b alike."""
+    """Estimate a drift in one series of the pair a, b; both: in the series of a and b alike."""
     shape = (2, 4, AREAS)
     likelihood = np.zeros(shape)
     likelihood[0, series, area] = 100.0

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of the drift watch against matrices and sums that are written out."""
+"""Parts of the drift watch against explicit matrices and sums."""
 
 from types import SimpleNamespace as Fake
 
@@ -47,7 +47,7 @@ def positive(n, rng=RNG):
     return half @ half.T + np.eye(n)
 
 
-# ---- what the rays tell of a change
+# ---- information of the rays on a change
 
 
 def test_moment_and_evidence_are_those_of_a_normal_prior():
@@ -68,7 +68,7 @@ def test_moment_and_evidence_are_those_of_a_normal_prior():
 
 @pytest.mark.parametrize('scale', [0.5, 3.0])
 def test_factor_of_the_variance_is_that_of_residuals_less_what_unknowns_take(scale):
-    """Of 40 residuals, 15 unknowns take up a part; false matches hardly count."""
+    """15 unknowns absorb a part of 40 residuals; false matches hardly count."""
     rng = np.random.default_rng(4)
     variance = rng.uniform(0.5, 2.0, 40)
     found = []
@@ -97,7 +97,7 @@ def orientation(names):
 
 @pytest.mark.parametrize(('names', 'knocked'), [('ab', [1]), ('abc', [0, 1, 2])])
 def test_causes_are_a_knock_and_a_shift_of_each_fluoroscope(names, knocked):
-    """Of two, a knock of the first is one of the second."""
+    """With two fluoroscopes, a knock of the first is equivalent to one of the second."""
     found = rig_change._hypotheses(orientation(tuple(names)))
     expected = []
     for f in range(len(names)):
@@ -112,7 +112,7 @@ def test_causes_are_a_knock_and_a_shift_of_each_fluoroscope(names, knocked):
 
 
 def test_a_block_has_the_median_residual_of_each_marker():
-    """With the variance of a median, where the marker was then."""
+    """With the variance of a median, at the position of the marker then."""
     geometry = Fake(by_orientation=lambda a, b: np.hstack([a, b, np.zeros((len(a), 14))]))
     change = RigChange(orientation(('a', 'b', 'c')), [(0, 1, geometry), (0, 2, geometry)])
     ids = np.array([4, 9, 5])
@@ -123,7 +123,7 @@ def test_a_block_has_the_median_residual_of_each_marker():
         change.add(1, ids, (uv, uv + 1), found, np.full(3, 1.0 + step))
     change.close()
     (rays,) = change._blocks
-    assert rays.residual.tolist() == [2.0, 0.2, -1.0]  # of 4, of 5 (the upper of two), of 9
+    assert rays.residual.tolist() == [2.0, 0.2, -1.0]  # of ids 4, 5 (the upper of two) and 9
     expected = np.pi / 2 * np.array([3.0, 3.0, 1.0]) / [3, 2, 3]
     np.testing.assert_allclose(rays.noise, expected)
     np.testing.assert_allclose(rays.systematic, [1.0, 1.0, 3.0])
@@ -142,14 +142,14 @@ def test_rays_are_apart_beyond_four_standard_deviations(residual, apart):
     change.add(0, np.arange(3), (uv, uv), found, np.full(3, 5.0))
     change.close()
     assert change.blocks_apart == apart
-    assert change._blocks[0].systematic.tolist() == [0, 0, 0]  # more noise than in all
+    assert change._blocks[0].systematic.tolist() == [0, 0, 0]  # the noise exceeds the total
 
 
 # ---- bodies
 
 
 def body_scene(n=3, markers=5, views=3, seed=7):
-    """Image points of bodies at a pose, some of them not seen."""
+    """Image points of bodies in a pose, some of them not seen."""
     rng = np.random.default_rng(seed)
     seen = np.ones((n, markers, views), dtype=bool)
     seen[np.arange(n), np.arange(n), np.arange(n) % views] = False
@@ -193,7 +193,7 @@ def test_what_a_body_tells_of_a_shift_is_that_of_least_squares_with_its_pose():
             own = variance[body, m] * np.trace(s[m])
             for f in np.flatnonzero(points.seen[body, m]):
                 for k in range(2):
-                    # A shift of one pixel moves the place by this much.
+                    # Change of the place by a shift of one pixel.
                     moved[m, f, k] = np.linalg.solve(
                         s[m], linear.by_place[body, m, f, k] / points.noise[body, m, f]
                     )
@@ -225,7 +225,7 @@ def test_what_a_body_tells_of_a_shift_is_that_of_least_squares_with_its_pose():
 
 
 def test_displacements_of_a_body_are_clipped_from_its_robust_pose():
-    """Where all fit, what is left of the displacements has no pose; a false one is limited."""
+    """If all fit, the displacements left have no pose part; a false one is limited."""
     linear, points, variance = body_scene(n=2, markers=12)
     watch = BodyWatch.__new__(BodyWatch)
     watch._options = DriftOptions()
@@ -244,7 +244,7 @@ def test_displacements_of_a_body_are_clipped_from_its_robust_pose():
     )
     clipped = watch._clipped(false)
     length = np.sqrt(np.einsum('nmi,nmij,nmj->nm', clipped, false.s_matrix, clipped))
-    # 3 deviations of one coordinate are 3.76 of three: chi-square of as rare.
+    # 3 deviations of one coordinate are as rare as 3.76 of three, by chi-square.
     strongest = np.sqrt(false.square.max(axis=(2, 3)))
     limit = 3.76 + 3 * np.sqrt(3 * false.systematic) + (0.15 + 2 * 0.1) * strongest
     assert 0.4 * limit[0, 4] < length[0, 4] < 1.3 * limit[0, 4]
@@ -257,7 +257,7 @@ def test_displacements_of_a_body_are_clipped_from_its_robust_pose():
 
 
 def test_stretch_counts_white_noise_apart_from_noise_that_lasts():
-    """By the mean squares of differences that white noise and an autoregression have."""
+    """Expected squared differences are those of white noise plus an autoregression."""
     for white, r in ((0.5, 0.8), (0.2, 0.5), (2.0, 0.9)):
         watch = PairWatch([(9, 9), (9, 9)], ImageAreas(2), DriftOptions(cells=2))
         watch._count, n = 1e9, 30
@@ -291,7 +291,7 @@ def test_correlation_is_of_frames_of_the_same_marker_and_fades():
     ]
     np.testing.assert_allclose(watch._squares, squares)
     assert watch._count == 2 + 3 and watch._frames == pytest.approx(5 * 13 / 2)
-    watch._update_correlation(np.array([0, 0, 1, 1]), z[:4])  # too few frames of any marker
+    watch._update_correlation(np.array([0, 0, 1, 1]), z[:4])  # too few frames of each marker
     assert watch._count == 5
     watch._update_correlation(marker, z)
     assert watch._count == pytest.approx(5 * (2 - 1 / 160))
@@ -320,7 +320,7 @@ def test_field_has_the_normal_equations_of_mean_residuals_and_its_prior():
     square = np.sum((place[:, None] - place) ** 2, axis=2)
     prior = (np.exp(-square / (2 * 0.12**2)) + np.exp(-square / 2)) / 2 + 1e-6 * np.eye(64)
     prior = np.mean(systematic**2) * np.kron(np.eye(2), prior)
-    # Least-squares collocation, in the space of the observations.
+    # Least-squares collocation in the space of the observations.
     noise = 1.7 * np.diag(1 / np.array(weight))
     gain = prior @ rows.T @ np.linalg.inv(rows @ prior @ rows.T + noise)
     np.testing.assert_allclose(field.mean, gain @ means, atol=1e-8)
@@ -378,7 +378,7 @@ def test_series_against_the_start_are_less_the_field_and_as_unsure_as_it():
 
 
 def records(scores, informations):
-    """Records of one series and area, a second each."""
+    """Records of one series and area, one per second."""
     return [
         BlockRecord(10**9 * k, np.array([[s]]), np.array([[i]]), np.zeros((1, 1)), None)
         for k, (s, i) in enumerate(zip(scores, informations))
@@ -417,7 +417,7 @@ def test_charts_against_the_start_are_preferred_where_one_of_them_shows_a_drift(
 
 
 def test_likeliest_fluoroscope_is_that_of_all_its_pairs():
-    """Of a, b and c: the series of ab, ac and bc, first one and second one."""
+    """Fluoroscopes a, b, c have the series of ab, ac and bc, for the first and second one."""
     found = EpipolarEvidence(Fake(), ('a', 'b', 'c'), 4)
     likelihood = np.zeros((12, 3))
     likelihood[[3, 10], 2] = [10.0, 12.0]  # b in ab and in bc, against the start
@@ -451,7 +451,7 @@ def test_likeliest_view_of_bodies_has_the_largest_component():
     ],
 )
 def test_a_drift_is_confirmed_by_the_other_bodies(scores, source, confirmed):
-    """By three standard deviations of their scores: 2 x 25 of information, a factor of 2."""
+    """Scores must exceed three standard deviations: information 2 x 25, variance factor 2."""
     charts = Fake(variance_factor=lambda: np.full((4, 2), 2.0))
     found = BodyEvidence(charts, ('a', 'b'), 4, ('one', 'two', 'three'))
     score = np.zeros((3, 4, 2))
@@ -478,7 +478,7 @@ def test_thresholds_are_those_of_all_charts():
     rig = true_orientation(fluoroscopes, true_calibrations(fluoroscopes))
     sizes = dict.fromkeys('abc', (100, 100))
     both = DriftWatch(sizes, DriftOptions(cells=2), [body], rig)
-    # Two series more of each view.
+    # Two more series per view.
     assert both.thresholds == pytest.approx(np.log(2 * (3 * 4 + 6) * 9 * blocks))
     assert watch._bodies.charts._step == pytest.approx(2 * watch._epipolar.charts._step)
 
@@ -557,7 +557,7 @@ def test_the_start_is_learned_block_by_block_and_then_tested(monkeypatch):
     for block in range(8):
         watch.add_residuals(5 * 10**8 * block, 'b', 'a', observations(np.zeros(12)))
         found.append((watch.state.finding.kind, watch.state.learning, watch.watched_s))
-    # A block is closed by the next one; the first four are learned.
+    # A block is closed by the next one; the first four are used for learning.
     assert [kind for kind, _, _ in found] == (
         [Kind.NO_MARKERS] + [Kind.LEARNING] * 3 + [Kind.NO_DRIFT] * 4
     )
@@ -672,7 +672,7 @@ def test_rays_that_no_longer_meet_are_an_error_since_they_do_not(share, is_knock
 
 
 def recorded(states, seconds=None, widenings=(), watched_s=20.0, monkeypatch=None):
-    """Verdict of a recording with these states, one a second."""
+    """Verdict on a recording with these states, one per second."""
     watch = RecordingDriftWatch.__new__(RecordingDriftWatch)
     quiet = state_of(OK, evidence=0.0)
     vars(watch).update(
@@ -708,7 +708,7 @@ def test_verdict_on_a_recording_is_that_of_its_worst_state(monkeypatch):
     states = [calm, warn, error, later, error, calm]
     found = recorded(states, widenings=[None, *wide, None, None], monkeypatch=monkeypatch)
     assert found.state is later and found.level == 'error' and found.level_at_end == 'ok'
-    assert found.found_ns == 102 * 10**9  # where the level was first reached
+    assert found.found_ns == 102 * 10**9  # time at which the level was first reached
     assert found.began_ns == 103 * 10**9 - 3 * 10**9
     assert found.widening is wide[1] and found.watched_s == 20.0
     assert 'found 2.0 s after the beginning; it was gone at the end' in found.finding.cause

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What parts of a recording are calibrated with, and when a given interior is contradicted."""
+"""Calibration of parts of a recording, and contradiction of a given interior orientation."""
 
 import time
 from types import SimpleNamespace as Fake
@@ -35,7 +35,7 @@ def calibration(kind='collocation', kept=500, c=4000.0, series=None, **changes):
 
 
 def evidence(calibrations=None, parts=(), monkeypatch=None, **request):
-    """Evidence of two fluoroscopes of 6 exposures, and the calls of `calibrate_part`."""
+    """Evidence of two fluoroscopes with 6 exposures, and the calls of `calibrate_part`."""
     given = {'a': frames(6), 'b': frames(6)}
     options = CalibrationOptions(**request)
     targets = Fake(target_id=np.arange(100), xyz_mm=np.zeros((100, 3)))
@@ -98,7 +98,7 @@ def test_a_part_has_the_model_that_is_validated(monkeypatch, kinds, asked, model
 @pytest.mark.parametrize(
     ('first', 'count'),
     [
-        ({'a': calibration(kept=160)}, 1),  # 80 % of 200, as of the whole
+        ({'a': calibration(kept=160)}, 1),  # 80 % of 200, the number of the whole
         ({'a': calibration(kept=155)}, 1),
         ({'a': calibration(kept=153)}, 2),
         (DataError('not enough'), 2),
@@ -144,7 +144,7 @@ def test_trend_is_significant_beyond_chance_and_claim(size, limit, claimed, is_s
     assert found.limit == pytest.approx(0.5) and found.is_significant is is_significant
 
 
-# ---- held out
+# ---- held-out exposures
 
 
 def test_exposures_that_fit_only_with_their_own_calibration_stop_the_check(monkeypatch):
@@ -187,7 +187,7 @@ def contradicted(rmse, free, sd=(3.0, 3.0, 30.0), corrects=True):
         (((1.06, 1.06), (1.0, 1.0)), (499.5, 420.0, 4100.0), True, 4.1),
         (((1.9, 1.9), (1.0, 1.0)), (499.5, 399.5, 4300.0), False, None),
         (((2.1, 2.1), (1.0, 1.0)), (499.5, 399.5, 4300.0), False, 6.0),
-        (((1.0, 1.4), (1.2, 1.0)), (499.5, 399.5, 4300.0), True, 6.0),  # of both coordinates
+        (((1.0, 1.4), (1.2, 1.0)), (499.5, 399.5, 4300.0), True, 6.0),  # for both coordinates
     ],
 )
 def test_a_given_interior_is_contradicted_by_residuals_and_by_what_is_found(
@@ -249,7 +249,7 @@ def test_what_fails_waits_for_the_given_interior_of_its_fluoroscope(monkeypatch)
 
 
 def test_checks_are_in_the_order_of_fluoroscopes_and_those_of_the_rig_are_last(monkeypatch):
-    """With the frames that were used, by their numbers, and steps that are counted."""
+    """Checks contain the numbers of the frames that were used, and steps are counted."""
 
     def check_of(kind, name):
         return Check(kind, 'x', Place((name,) if name else ()), value=0.5, limit=1.0)

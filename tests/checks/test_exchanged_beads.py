@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Beads exchanged in the survey are found from few image points; exchanged ids are not them."""
+"""Beads exchanged in the survey are found from few image points; exchanged ids are not."""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ def test_two_exchanged_beads_are_named(scene):
 
 
 def test_two_exchanged_beads_of_many_exposures_are_named(scene):
-    """Where chances are too small for a number; one image point has no correction."""
+    """Chances are too small to be represented; one image point has no correction."""
     rays, targets = scene
     pair = nearest_pair(targets)
     columns = [getattr(rays, name) for name in Rays.__dataclass_fields__]
@@ -82,7 +82,7 @@ def test_two_exchanged_beads_of_many_exposures_are_named(scene):
 
 
 def test_beads_that_one_exposure_each_shows_are_named(scene):
-    """Whatever a false match does to one more of their image points."""
+    """A false match at one more of their image points does not prevent this."""
     rays, targets = scene
     first, second = nearest_pair(targets)
     of_first, of_second = (rays.target_id == one for one in (first, second))
@@ -107,7 +107,7 @@ def test_ids_exchanged_in_one_exposure_are_no_exchanged_beads(scene):
 
 
 def test_one_bead_at_the_place_of_another_is_not_exchanged_with_it(scene):
-    """Both must be elsewhere."""
+    """Each must be at the place of the other."""
     rays, targets = scene
     first, second = nearest_pair(targets)
     target_id = np.where(rays.target_id == first, second, rays.target_id)
@@ -117,7 +117,7 @@ def test_one_bead_at_the_place_of_another_is_not_exchanged_with_it(scene):
 
 @pytest.mark.parametrize('share', [0.0, 0.02, 0.1, 0.4])
 def test_false_matches_exchange_no_beads(scene, share):
-    """Of any bead, and of the nearest one."""
+    """Matches to a random bead, and to the nearest one."""
     rays, targets = scene
     rng = np.random.default_rng(5)
     distance = np.linalg.norm(targets.xyz_mm[:, None] - targets.xyz_mm, axis=2)
@@ -143,7 +143,7 @@ def test_beads_behind_the_source_are_at_no_place(scene):
 
 
 def test_beads_are_counted_by_exposures(scene):
-    """Ids exchanged in the only exposure that shows two beads tell nothing of their survey."""
+    """Ids exchanged in the only exposure of both beads are no evidence on the survey."""
     rays, targets = scene
     first, second = nearest_pair(targets)
     both = [

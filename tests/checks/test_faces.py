@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faces of a phantom that are out of place, exposures of different noise."""
+"""Displaced faces of a phantom, and exposures of different noise."""
 
 import numpy as np
 import pytest
@@ -21,12 +21,12 @@ def plates(rng):
 
 
 def cloud(rng):
-    """Beads anywhere in a box."""
+    """Beads at random positions in a box."""
     return rng.uniform(-120, 120, (160, 3))
 
 
 def beads_of(survey, displacement, rng):
-    """Beads that images find at the survey and a displacement (n, 3) [mm], with noise."""
+    """Beads whose images show the survey plus a displacement (n, 3) [mm], with noise."""
     n = len(survey)
     found = survey + displacement + rng.normal(0, SD_MM, (n, 3))
     covariance = np.tile((SD_MM**2 - 0.1**2) * np.eye(3), (n, 1, 1))
@@ -37,7 +37,7 @@ def test_a_plate_that_is_shifted_is_named():
     rng = np.random.default_rng(1)
     survey = plates(rng)
     shift = (survey[:, 2:] > 0) * np.array([0.0, 0.6, 0.8])
-    # The orientations follow all beads: half of the shift is seen in either plate.
+    # The orientations follow all beads, so half of the shift is seen in either plate.
     beads = beads_of(survey, shift - shift.mean(axis=0), rng)
     layer = displaced_layer(beads)
     assert layer.axis == 2 and set(layer.target_id) in ({*range(100)}, {*range(100, 200)})
@@ -58,7 +58,7 @@ def test_a_plate_is_named_where_no_single_bead_stands_out():
 
 @pytest.mark.parametrize('along', [0, 1])
 def test_a_plate_that_is_tilted_is_named(along):
-    """By 1 mm at its rim, and nothing in its middle."""
+    """By 1 mm at its rim, and not at all in its middle."""
     rng = np.random.default_rng(2)
     survey = plates(rng)
     tilt = np.where(survey[:, 2] > 0, survey[:, along] / 110.0, 0.0)[:, None] * [0, 0, 1.0]
@@ -110,7 +110,7 @@ def test_single_beads_and_noise_are_no_layer(shape):
 
 @pytest.mark.parametrize('shape', [plates, cloud])
 def test_errors_of_the_survey_select_no_layer(shape):
-    """The beads of a plate that are surveyed too high are no layer of their own."""
+    """Beads of a plate that were surveyed too high do not form a layer."""
     rng = np.random.default_rng(6)
     for _ in range(20):
         true = shape(rng)
@@ -125,7 +125,7 @@ def test_errors_of_the_survey_select_no_layer(shape):
 
 
 def test_noise_that_differs_between_exposures_accuses_none():
-    """An exposure stands out only against the scatter of all."""
+    """An exposure stands out only relative to the scatter of all exposures."""
     rng = np.random.default_rng(4)
     same = np.exp(rng.normal(0, 0.04, 15))
     assert np.all(exposure_limits(same, same) <= EXPOSURE_LIMIT * np.maximum(same, 1))
@@ -144,7 +144,7 @@ def test_noise_that_differs_between_exposures_accuses_none():
 
 
 def test_a_misfit_accuses_an_exposure_however_much_the_others_scatter():
-    """Its residuals agree with their neighbours, so that they are no noise of its own."""
+    """Its residuals agree with their neighbours, so they are not noise of this exposure."""
     rng = np.random.default_rng(5)
     ratio = np.exp(rng.uniform(np.log(0.1), np.log(0.6), 15))
     ratio /= np.median(ratio)

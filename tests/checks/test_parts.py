@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which exposures the checks calibrate and test with: never the same."""
+"""Exposures used by the checks for calibration and for testing are disjoint."""
 
 from types import SimpleNamespace
 
@@ -17,7 +17,7 @@ COUNT = 11
 
 
 class Recorded(SimpleNamespace):
-    """Evidence that notes the exposures that are asked for; they are numbers here."""
+    """Evidence that records which exposures are requested; exposures are numbers here."""
 
     def __init__(self, fails=False, count=COUNT):
         names = ('a', 'b')
@@ -70,11 +70,11 @@ def test_exposures_that_are_held_out_are_in_no_calibration():
             assert not set(trained[name]) & set(tested[name])
             assert set(trained[name]) | set(tested[name]) == set(range(COUNT))
         held += tested['a']
-    assert sorted(held) == list(range(COUNT))  # each once
+    assert sorted(held) == list(range(COUNT))  # each exposure once
 
 
 def test_parts_that_are_held_out_are_counted(monkeypatch):
-    """All four are announced, also where there are only three exposures to hold out."""
+    """All four are announced, even if only three exposures can be held out."""
     for count, folds in ((3, 3), (4, 4), (11, 4)):
         evidence, shown, asked = Recorded(count=count), [], []
         evidence.report_step = shown.append

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Between an alarm of the drift watch and healing, standard deviations contain what it shows."""
+"""From an alarm of the drift watch until healing, standard deviations include the change."""
 
 import functools
 from dataclasses import replace
@@ -28,8 +28,8 @@ from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
 RATE_HZ = 30.0
-BUMPED = 360  # exposure
-SEEDS = range(4)  # of knocks: how far off points are varies with their direction
+BUMPED = 360  # first exposure after the knock
+SEEDS = range(4)  # seeds of knocks: the error of points depends on the direction
 BODY = np.arange(1001, 1007)
 
 
@@ -70,7 +70,7 @@ def scene(size, seed=0):
 
 
 def squares(found, truth):
-    """NSE of points by exposure; NaN where none is found."""
+    """NSE of points by exposure; NaN if none is found."""
     out = []
     for frame in found:
         rows = np.searchsorted(truth.marker_id, frame.target_id)
@@ -121,7 +121,7 @@ def geometry():
 
 
 def shown_blocks(geometry, blocks):
-    """What blocks of five exposures show; each: what the rays of its markers miss by [px]."""
+    """RigChange after blocks of five exposures, each given by the misses of its rays [px]."""
     orientation, pair = geometry
     change = RigChange(orientation, [(0, 1, pair)])
     for missed in blocks:
@@ -142,9 +142,9 @@ MEETS, APART = [0.1] * 4, [9.0] * 4
         ([MEETS, APART], 0.0, 1),
         ([MEETS, APART, APART], 1.0, 2),
         ([MEETS, APART, [9.0, -9.0, 0.1, 9.0]], 0.75, 2),
-        ([MEETS, APART, [9.0, 0.1, 0.1, 9.0]], 0.0, 0),  # as many meet
+        ([MEETS, APART, [9.0, 0.1, 0.1, 9.0]], 0.0, 0),  # as many rays meet
         ([MEETS, APART, MEETS, APART], 0.0, 1),
-        ([APART, APART, APART], 0.0, 3),  # confused, as they have never met
+        ([APART, APART, APART], 0.0, 3),  # confused recordings, as the rays have never met
         ([MEETS, APART[:2], APART[:2]], 0.0, 0),  # too few markers
         ([MEETS, APART[:3], APART[:3]], 1.0, 2),
         ([MEETS, [APART, APART, MEETS, MEETS, MEETS]] * 2, 0.0, 0),  # false matches of some
@@ -156,7 +156,7 @@ def test_knock_is_shown_by_two_blocks_in_which_most_rays_are_apart(geometry, blo
 
 
 def test_what_is_added_grows_with_what_the_rays_show(geometry):
-    """Of the newest blocks only; nothing is known without a block of enough markers."""
+    """Only the newest blocks count; without a block of enough markers nothing is known."""
     assert shown_blocks(geometry, [APART[:2]]).addition(1) is None
     change = shown_blocks(geometry, [APART, MEETS, MEETS])
     newest, all_three = change.addition(2), change.addition(3)
@@ -171,7 +171,7 @@ def test_what_is_added_grows_with_what_the_rays_show(geometry):
 
 @pytest.mark.long
 def test_points_of_a_knocked_rig_are_found_with_honest_deviations():
-    """Most rays no longer meet; without the alarm there would hardly be a point."""
+    """Most rays no longer meet, so there would hardly be a point without the alarm."""
     alarm = BUMPED + round(1.5 * RATE_HZ)
     mean = []
     for seed in SEEDS:
@@ -226,7 +226,7 @@ def test_small_drift_widens_poses():
 
 
 def test_what_an_alarm_adds_ends_with_what_the_rays_show():
-    """The alarm goes on for a while; what it adds is what the newest rays show."""
+    """The alarm lasts for a while, but the addition follows the newest rays."""
     calibrations, orientation, frames, _ = scene(0.3)
     again = {n: [*of, *_later(of[: round(5 * RATE_HZ)])] for n, of in frames.items()}
     watch = RigDriftWatch(orientation, {n: calibrations[n].image_size for n in 'ab'})

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the poses of two fluoroscopes say about their rig, with poses that are given."""
+"""Findings on the rig of two fluoroscopes, from given poses."""
 
 from types import SimpleNamespace as Fake
 
@@ -31,11 +31,11 @@ from fluoro_calib_ros.photogrammetry.rotations import (
 
 RNG = np.random.default_rng(7)
 TURN = matrix_from_vector(np.array([0.1, 1.0, -0.2]))  # from sensor to sensor
-BASE_MM = np.array([900.0, 50.0, 600.0])  # of the second source, in the first sensor
+BASE_MM = np.array([900.0, 50.0, 600.0])  # second source in the frame of the first sensor
 
 
 def poses(numbers, shifts_mm=0.0, turns_rad=0.0):
-    """Results of two fluoroscopes of a rig, whose second one is shifted and turned by exposure."""
+    """Results of two fluoroscopes; the second is shifted and rotated per exposure."""
     one, other = [], []
     shifts_mm = np.broadcast_to(shifts_mm, (len(numbers),))
     turns_rad = np.broadcast_to(turns_rad, (len(numbers),))
@@ -64,7 +64,7 @@ def test_interchanged_frames_are_named_by_their_exposures():
     found = interchanged(('a', 'b'), *swapped(one, other, (11, 16)))
     assert found.kind is Kind.FLUOROSCOPES_INTERCHANGED
     assert (found.place.fluoroscopes, found.place.exposures) == (('a', 'b'), (11, 16))
-    # One that is only far away is another matter, and two pairs tell nothing.
+    # A single distant pair is a different case, and two pairs show nothing.
     shifts = np.zeros(8)
     shifts[3] = 900.0
     assert interchanged(('a', 'b'), *poses(range(8), shifts)) is None
@@ -85,7 +85,7 @@ def test_interchanged_frames_are_named_by_their_exposures():
 def test_pairs_contradict_from_a_hundredth_of_their_distance_or_a_degree(
     shift_mm, turn_deg, ratio
 ):
-    """By the median: most pairs are off by so much, up and down."""
+    """The median counts: most pairs deviate by this amount, in alternating directions."""
     signs = np.array([1, -1, 1, -1, 0, 1, -1, 1, -1])
     one, other = poses(range(9), shift_mm * signs, np.deg2rad(turn_deg) * signs)
     found = contradiction(('a', 'b'), one, other)
@@ -113,7 +113,7 @@ def test_fluoroscopes_near_each_other_may_be_off_by_a_centimetre():
         for a, b in zip(one.exposures, other.exposures):
             b.position_mm = a.position_mm + 0.2 * (b.position_mm - a.position_mm)
         found = contradiction(('a', 'b'), one, other)
-        assert found is None  # a fifth of the shift
+        assert found is None  # the distance scales the shift down to a fifth
         for a, b, sign in zip(one.exposures, other.exposures, signs):
             b.position_mm = a.position_mm + [100.0 + sign * shift_mm, 0, 0]
             a.quaternion_wxyz = b.quaternion_wxyz = np.array([1.0, 0, 0, 0])
@@ -123,11 +123,11 @@ def test_fluoroscopes_near_each_other_may_be_off_by_a_centimetre():
     assert contradiction(('a', 'b'), *few) is None
 
 
-# ---- how pairs scatter
+# ---- scatter of pairs
 
 
 def scatter(count=8, names=('a', 'b'), off_px=4.0, unexplained=3.0, steps=()):
-    """Pairs of a rig whose second fluoroscope moves by steps {index: (mm, rad)} for good."""
+    """Pairs of a rig whose second fluoroscope moves permanently by steps {index: (mm, rad)}."""
     shift = np.tile(BASE_MM, (count, 1)) + RNG.normal(0, 0.05, (count, 3))
     angle = np.zeros(count)
     for index, (mm, rad) in dict(steps).items():
@@ -151,7 +151,7 @@ def scatter(count=8, names=('a', 'b'), off_px=4.0, unexplained=3.0, steps=()):
 
 
 def shuffled(pairs):
-    """The same pairs in another order."""
+    """The same pairs in a different order."""
     order = RNG.permutation(len(pairs.exposures))
     names = ('exposures', 'off_px', 'off_sd', 'used', 'columns', 'turn', 'shift_mm')
     changed = {name: getattr(pairs, name)[order] for name in names}
@@ -188,7 +188,7 @@ def finding(kind, names=('a', 'b'), cause='why', **numbers):
 
 
 def test_check_of_a_rig_is_the_scatter_of_each_pair_against_noise_and_prediction():
-    """What is wrong with one pair is said of that pair only."""
+    """A fault of one pair is reported for that pair only."""
     first = scatter(off_px=4.0, unexplained=2.5)
     second = scatter(names=('a', 'c'), off_px=0.4, unexplained=0.8)
     first.used[0] = False
@@ -249,7 +249,7 @@ def stamped(number, stamp_ns, u):
 
 
 def findings_of(monkeypatch, scatters, figures=None, delay_ns=0, known=()):
-    """Findings on three fluoroscopes whose pairs scatter so."""
+    """Findings on three fluoroscopes whose pairs scatter as given."""
     names = ('a', 'b', 'c')[: len(scatters) + 1] if isinstance(scatters, list) else ('a', 'b')
     asked = {}
 

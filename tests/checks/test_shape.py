@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A survey that is strained as a whole is found; what the exposures cannot tell is said."""
+"""A survey that is strained as a whole is found; strain that exposures cannot show is stated."""
 
 import functools
 from dataclasses import replace
@@ -36,16 +36,16 @@ def rig():
 
 
 def with_targets(frame, ids):
-    """A frame of these targets only."""
+    """A frame with these targets only."""
     used = np.isin(frame.target_id, ids)
     return replace(frame, target_id=frame.target_id[used], uv=frame.uv[used])
 
 
 @functools.cache
 def evidence(shrunk=0.0, seed=0, small=False):
-    """Evidence on a calibration with a survey that is too short in z, with errors of its own.
+    """Evidence on a calibration with a survey that is too short in z and has random errors.
 
-    small: of every sixth bead in six exposures, without a correction.
+    small: use every sixth bead in six exposures, without a correction.
     """
     rng = np.random.default_rng(seed)
     here, frames = rig()
@@ -66,21 +66,21 @@ def evidence(shrunk=0.0, seed=0, small=False):
 @pytest.mark.long
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_an_honest_survey_has_no_strain(seed):
-    """The statistic is chi-square with five degrees of freedom, nearly."""
+    """The statistic is approximately chi-square with five degrees of freedom."""
     (check,) = check_shape(evidence(seed=seed), ('a',))
     assert check.kind is Kind.SHAPE and check.passed
-    assert check.numbers['test'] < 18  # 0.3 %
+    assert check.numbers['test'] < 18  # exceeded in 0.3 % of cases
     assert trusted_shape([check]) == []
 
 
 @pytest.mark.long
 def test_a_phantom_that_is_short_in_one_axis_is_found_with_axis_and_size():
-    """By 0.2 %, where no bead is off by more than three times the sd of its survey."""
+    """It is short by 0.2 %, so no bead is off by more than three sd of its survey."""
     found = strain_of_survey(evidence(0.002))
     assert found.test > 3 * found.critical
     values, vectors = np.linalg.eigh(found.tensor)
     assert abs(vectors[2, 0]) > 0.95  # the shortest axis
-    # Without the common scale, and less what the correction has followed.
+    # The common scale is removed, and the correction has followed a part.
     assert -0.002 < values[0] < -0.0007
     (check,) = check_shape(evidence(0.002), ('a',))
     assert check.passed is False and check.value > check.limit
@@ -109,7 +109,7 @@ def test_strain_is_that_of_the_normal_equations_and_what_hides_most_is_told(monk
 
     np.testing.assert_allclose(own, np.linalg.solve(information, pull))
     assert found.test == pytest.approx(own @ pull)
-    # Of three coordinates each.
+    # The mean is over three coordinates.
     assert found.nse == pytest.approx(increase(own))
     assert hidden @ information @ hidden == pytest.approx(found.critical)
     assert increase(hidden) == pytest.approx(found.hidden_nse)
@@ -118,7 +118,7 @@ def test_strain_is_that_of_the_normal_equations_and_what_hides_most_is_told(monk
         assert increase(other) <= found.hidden_nse
     offset = survey - survey.mean(axis=0)
     moved = offset @ found.tensor
-    # At most: what a similarity takes up is no strain.
+    # An upper bound: the part that a similarity absorbs is no strain.
     assert 0 < found.rms_mm <= np.sqrt(np.mean(np.sum(moved**2, axis=1)))
 
 
@@ -134,8 +134,8 @@ def test_a_strain_that_nobody_would_see_is_taken_on_trust():
 @pytest.mark.parametrize(
     ('test', 'nse', 'limit'),
     [
-        (40.0, 1.0, 0.2 * np.sqrt(20 / 40)),  # what chance exceeds
-        (40.0, 0.3, 0.2 * np.sqrt(0.25 / 0.3)),  # what does not matter
+        (40.0, 1.0, 0.2 * np.sqrt(20 / 40)),  # limit set by chance
+        (40.0, 0.3, 0.2 * np.sqrt(0.25 / 0.3)),  # limit set by what matters
         (5.0, 1.0, 0.4),
     ],
 )
@@ -176,7 +176,7 @@ def test_few_beads_and_free_networks_have_no_strain_of_a_survey(beads, datum):
 
 
 def test_strain_of_a_small_set_has_axis_and_size():
-    """0.4 % in one axis, less the third of it that is a common scale."""
+    """0.4 % in one axis, less the third that is a common scale."""
     found = strain_of_survey(evidence(0.004, small=True))
     values, vectors = np.linalg.eigh(found.tensor)
     assert abs(vectors[2, 0]) > 0.99
@@ -189,14 +189,14 @@ def test_strain_of_a_small_set_has_axis_and_size():
 
 
 def test_a_flat_phantom_has_two_strains():
-    """A strain along its normal turns or enlarges it, which no image shows."""
+    """A strain along its normal acts as a rotation or a scale, which no image shows."""
     rng = np.random.default_rng(3)
     survey = np.column_stack([rng.uniform(-90, 90, (40, 2)), np.zeros(40)])
     tilt = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     for beads, count in ((survey, 2), (survey @ tilt.T + 500, 2), (rng.normal(size=(40, 3)), 5)):
         displacement = _without_similarity(_strains(beads)[1], beads, np.full(40, 0.1))
         assert _strains_that_show(displacement).shape == (5, count)
-        # Nothing is left of a shift, a turn and a scale.
+        # Shift, rotation and scale are removed completely.
         offset = beads - beads.mean(axis=0)
         assert np.einsum('nai->ai', displacement) == pytest.approx(0.0, abs=1e-9)
         assert np.einsum('nai,na->i', displacement, offset) == pytest.approx(0.0, abs=1e-6)

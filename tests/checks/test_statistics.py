@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sums that the checks and the drift watch rest on, against loops that spell them out."""
+"""Sums used by the checks and the drift watch, against explicit loops."""
 
 from types import SimpleNamespace as Fake
 
@@ -52,7 +52,7 @@ def test_joins_are_the_products_of_neighbours_of_two_exposures():
 
 
 def test_scatter_has_a_degree_of_freedom_less_for_the_mean_of_each_group():
-    """Unit noise gives, cell by cell, the degrees of freedom themselves in the mean."""
+    """Unit noise gives, cell by cell, the degrees of freedom in the mean."""
     rng = np.random.default_rng(2)
     counts = rng.integers(0, 6, (400, 8))
     sums = rng.normal(size=(400, 8, 2)) * np.sqrt(counts)[..., None]
@@ -69,11 +69,11 @@ def test_scatter_has_a_degree_of_freedom_less_for_the_mean_of_each_group():
 
 
 SIZE = (800, 400)
-CELL = np.array([349.5, 224.5])  # centre of the one in column 3, row 4 of 8
+CELL = np.array([349.5, 224.5])  # centre of the cell in column 3, row 4 of 8
 
 
 def residuals(trend=(0.0, 0.0), bump=(0.0, 0.0), half=(0.0, 0.0), exposures=10, seed=4):
-    """Residuals of noise 0.3 px; trend: in all, bump: about CELL, half: as the halves differ."""
+    """Residuals of noise 0.3 px. trend: everywhere, bump: about CELL, half: between the halves."""
     rng = np.random.default_rng(seed)
     per = 400
     uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (exposures * per, 2))
@@ -86,7 +86,7 @@ def residuals(trend=(0.0, 0.0), bump=(0.0, 0.0), half=(0.0, 0.0), exposures=10, 
 
 
 def test_trend_of_all_exposures_is_found_with_its_size_and_place():
-    """The size is of a coordinate, that of a cell is the length."""
+    """Its overall size is per coordinate, that of a cell is a length."""
     calm = common_trend(residuals(), SIZE)
     assert calm.size < calm.limit < 0.05 and calm.cell_size < calm.cell_limit
     found = common_trend(residuals(trend=(0.3, -0.4)), SIZE)
@@ -96,7 +96,7 @@ def test_trend_of_all_exposures_is_found_with_its_size_and_place():
     np.testing.assert_allclose(local.place, CELL)
     assert local.cell_size == pytest.approx(0.5, rel=0.2) and local.cell_size > local.cell_limit
     assert local.size < 0.2
-    # About 62 points of noise 0.3 px in a cell, and 18 degrees of freedom in each of 64.
+    # About 62 points of noise 0.3 px in a cell, and 18 degrees of freedom in each of 64 cells.
     variance = 0.3**2 / (4000 / 64)
     expected = np.sqrt(2 * variance * special.fdtri(2, 64 * 18, 1 - FALSE_ALARM / 64))
     assert local.cell_limit == pytest.approx(expected, rel=0.25)
@@ -171,7 +171,7 @@ def test_rejected_points_of_an_exposure_agree_where_neighbours_are_alike():
         distance = np.linalg.norm(uv[25:59] - uv[i], axis=1)
         distance[i - 25] = np.inf
         pairs.add(frozenset((i, 25 + int(np.argmin(distance)))))
-    # Products of 5 px and 5 px, over the root of half the sum of their squares.
+    # Products of 5 px by 5 px, over the root of half the sum of their squares.
     assert found.agreement == pytest.approx(np.sqrt(2 * len(pairs)), rel=0.05)
     assert found.limit == pytest.approx(special.ndtri(1 - FALSE_ALARM / 3))
     false = rejected_exposure(given._part(exposure == 0), fitted)
@@ -183,7 +183,7 @@ def test_rejected_points_of_an_exposure_agree_where_neighbours_are_alike():
 
 
 def corner_of_exposures(alike, rng):
-    """Rejected points of six exposures in a corner, and far away of the first; some are alike."""
+    """Rejected points of six exposures in a corner, and far ones of the first; some are alike."""
     exposure = np.repeat(np.arange(6), [20, 4, 4, 4, 4, 4])
     uv = rng.uniform(900, 1000, (40, 2))
     uv[:6] -= 800
@@ -246,18 +246,18 @@ def test_exposures_of_another_orientation_are_named_with_the_largest_displacemen
 
 
 def test_image_points_that_fail_may_be_targets_that_nothing_else_is():
-    """The nearest first, each only of the point that is nearest to it, by the pose of theirs."""
+    """Nearest first; each only for its nearest point, by the pose of their exposure."""
     rotation = matrix_from_vector(np.array([0.1, -0.2, 0.3]))
     position = rotation.T @ np.array([5.0, -3.0, -900.0])
     interior = np.array([500.0, 400.0, 4000.0])
     rng = np.random.default_rng(2)
     ids = np.arange(10) + 20
     xyz = rng.uniform(-60, 60, (10, 3))
-    xyz[4] = xyz[3] + [1.0, 0, 0]  # 4.4 px beside it
+    xyz[4] = xyz[3] + [1.0, 0, 0]  # 4.4 px next to it
     x = (xyz - position) @ rotation.T
     ideal = interior[:2] + interior[2] * x[:, :2] / x[:, 2:]
     correction = np.tile([3.0, -2.0], (4, 1))
-    # Of four image points the first two fit; the last two are exchanged for others.
+    # The first two image points fit; the last two are exchanged for others.
     given = np.array([20, 21, 22, 23])
     uv = ideal[[0, 1, 3, 6]] + correction + [[0.1, 0], [0.1, 0], [0.5, 0], [0.3, 0]]
     pose = {'quaternion_wxyz': quaternion_from_matrix(rotation), 'position_mm': position}
@@ -276,10 +276,10 @@ def test_image_points_that_fail_may_be_targets_that_nothing_else_is():
     )
     here, rows = np.ones(4, bool), np.array([2, 3])
     found = _may_be(result, table, here, rows, np.array([20.0, 20.0]))
-    # Target 24 is beside 23, which is given to the other one that fails.
+    # Target 24 is next to 23, which is assigned to the other failing point.
     assert found == [(23, 24), (26,)]
     assert _may_be(result, table, here, rows, np.array([2.0, 0.2])) == [(23,), ()]
-    table.target_id = np.array([20, 23, 22, 26])  # 23 fits elsewhere, and 26 is its own id
+    table.target_id = np.array([20, 23, 22, 26])  # 23 fits elsewhere, and 26 has its own id
     assert _may_be(result, table, here, rows, np.array([20.0, 20.0])) == [(24,), ()]
     few = Fake(fluoroscopes=result.fluoroscopes, targets=Fake(target_id=ids[:2], xyz_mm=xyz[:2]))
     table.target_id = given

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Verdict on calibrations of a C-arm that turns."""
+"""Verdict on calibrations of a rotating C-arm."""
 
 from dataclasses import replace
 

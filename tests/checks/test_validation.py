@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verdict on a calibration: good ones pass, faults are found and named."""
+"""Verdict on a calibration: good ones pass, faults are found and named."""
 
 import functools
 import json
@@ -73,7 +73,7 @@ LOCAL = {'model': 'local_linear'}
 
 
 def rippled(frames, height=1.0, middle=(400.0, 600.0)):
-    """Frames whose later half has a local ripple [px] more."""
+    """Frames with an additional local ripple of height [px] in the second half."""
     out = []
     for i, frame in enumerate(frames):
         bump = np.exp(-np.sum((frame.uv - middle) ** 2, axis=1) / (2 * 80.0**2))
@@ -100,9 +100,9 @@ def verdict(fault='', **options):
 
 @functools.cache
 def weighted(error, sd, strength=0.1):
-    """Validation with a given principal distance that is off by a share of it.
+    """Validation with a given principal distance that is off by a relative error.
 
-    strength: of the distortion, which is not corrected.
+    strength: that of the distortion, which is not corrected.
     """
     of_rig = virtual_rig(1, names=('a',), strength=strength)
     frames = simulate_exposures(of_rig, 10, 1).frames
@@ -124,7 +124,7 @@ def test_a_given_principal_distance_that_the_exposures_contradict_is_the_first_f
 
 
 def test_a_contradicted_principal_distance_fails_where_the_noise_takes_its_misfit_up():
-    """A distance off by 5 % is 3 times the noise, which is estimated, so no other check fails."""
+    """An error of 5 % is 3 times the estimated noise, so no other check fails."""
     validation, shown = weighted(0.05, 1.0, strength=0.0)
     (found,) = validation.findings
     assert validation.verdict == 'fail' and found.kind is Kind.GIVEN_INTERIOR
@@ -133,18 +133,18 @@ def test_a_contradicted_principal_distance_fails_where_the_noise_takes_its_misfi
 
 @pytest.mark.parametrize('error', [0.0, 0.05])
 def test_a_weak_given_interior_orientation_is_not_accused(error):
-    """The exposures overrule it."""
+    """The exposures determine it better."""
     validation, _ = weighted(error, 200.0)
     assert 'given_interior' not in [check.name for check in validation.checks]
 
 
 def failed(validation):
-    """Names of the checks that failed."""
+    """Names of the failed checks."""
     return {check.name for check in validation.checks if check.passed is False}
 
 
 def noise(seed, exposures=12, count=120, sd=0.25, trend=lambda uv, e: 0.0):
-    """Residuals of white noise and a trend, function of pixels and exposure."""
+    """Residuals of white noise plus a trend, which is a function of pixels and exposures."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(0, 1023, (exposures * count, 2))
     e = np.repeat(np.arange(exposures), count)
@@ -154,7 +154,7 @@ def noise(seed, exposures=12, count=120, sd=0.25, trend=lambda uv, e: 0.0):
 
 
 def rejected(direction, targets=12):
-    """Image points (n,) about one place, of four exposures; direction (n,) of residuals [rad]."""
+    """Image points (n,) in one place, of four exposures; direction (n,) of residuals [rad]."""
     rng = np.random.default_rng(1)
     n = len(direction)
     uv = rng.uniform(300, 350, (n, 2))
@@ -164,7 +164,7 @@ def rejected(direction, targets=12):
     return Residuals(uv, r, e, target_id, np.arange(4), np.full(4, np.nan))
 
 
-# ---- the whole
+# ---- complete validations
 
 
 def test_good_calibration_passes():
@@ -179,10 +179,10 @@ def test_good_calibration_passes():
 
 
 def test_distortion_without_a_model_fails():
-    """By the trend in its residuals, and by exposures held out, whose residuals are no noise."""
+    """Shown by the trend in residuals and by held-out exposures, whose residuals are no noise."""
     found = verdict(model='none')
     assert found.verdict == 'fail' and {'whiteness', 'worst_area', 'held_out'} <= failed(found)
-    # Whatever it claims, nothing is corrected: the trend is what is achieved.
+    # Whatever is claimed, nothing is corrected: the trend is the achieved precision.
     trend = next(c.value for c in found.checks if c.kind is Kind.WHITENESS)
     assert found.achieved_sd_px['a'] >= trend > 0
     assert '--model auto' in found.findings[0].advice
@@ -191,7 +191,7 @@ def test_distortion_without_a_model_fails():
 
 
 def test_rejected_points_that_agree_are_no_false_matches():
-    """They show a distortion that is not followed, unless few targets have them."""
+    """They show a distortion that the model does not follow, unless few targets are affected."""
     rng = np.random.default_rng(2)
     others = rejected(np.ones(100))  # image points of the same place that fit
     found = rejected_trend(rejected(rng.normal(1.0, 0.3, 12)), others, SIZE)
@@ -214,7 +214,7 @@ def test_few_rejected_points_that_agree_are_enough_where_nearly_all_of_a_place_a
 
 
 def test_rejected_points_of_an_exposure_that_agree_are_no_false_matches():
-    """A smooth misfit of one exposure; false matches have directions of their own."""
+    """A smooth misfit of one exposure; directions of false matches are random."""
     rng = np.random.default_rng(3)
 
     def found(misfit):
@@ -278,7 +278,7 @@ def test_joint_validation_reports_progress_and_can_be_cancelled():
 
 
 def test_failed_adjustment_gives_cannot_tell():
-    """For the node, whose calibration stays; the command ends with the finding."""
+    """The node keeps its calibration; the command ends with the finding."""
     calibrations = calibrated('a', **LOCAL).calibrations
     few = {'a': [replace(f, target_id=f.target_id[:5], uv=f.uv[:5]) for f in exposures()['a']]}
     request = CalibrationRequest(few, rig().phantom)
@@ -300,7 +300,7 @@ def test_fail_takes_precedence_over_cannot_tell_and_pass():
 
 
 def test_new_check_is_one_subject(monkeypatch):
-    """A module with a Subject and its entry in SUBJECTS are all that a check needs."""
+    """A check consists of a module with a Subject and its entry in SUBJECTS."""
 
     def count_exposures(evidence, names):
         evidence.report_step('counting')
@@ -332,7 +332,7 @@ def test_new_check_is_one_subject(monkeypatch):
 def test_points_that_are_said_to_be_imprecise_are_no_misfit_of_their_exposure(
     monkeypatch, claimed, passes
 ):
-    """As beads in front of each other in images: a quarter of one exposure has an sd of 2 px."""
+    """As for overlapping beads: a quarter of one exposure has an sd of 2 px."""
     monkeypatch.setattr(verdict_module, 'SUBJECTS', (HELD_OUT,))
     rng = np.random.default_rng(8)
     frames = [replace(f, sigma=np.full(len(f.uv), 0.25)) for f in exposures()['a'][:8]]
@@ -352,7 +352,7 @@ def test_points_that_are_said_to_be_imprecise_are_no_misfit_of_their_exposure(
 
 
 def test_points_more_precise_than_the_survey_are_not_rejected_in_a_few_exposures():
-    """Noise of 0.03 px, where the survey of 0.1 mm is worth 0.3 px: bead images are that sharp."""
+    """Noise of 0.03 px, as of bead images, where the survey of 0.1 mm corresponds to 0.3 px."""
     detection = Detection(noise_px=0.03, false_matches=0.01)
     frames = {'a': simulate_exposures(rig(), 9, 5, detection).frames['a']}
     whole = calibrate(frames, rig().phantom).calibrations
@@ -363,7 +363,7 @@ def test_points_more_precise_than_the_survey_are_not_rejected_in_a_few_exposures
 
 
 def test_part_from_the_solution_is_that_from_observations_alone():
-    """Where it starts does not show in a calibration: it differs by far less than its errors."""
+    """The effect of the initial values on a calibration is far below its errors."""
     whole = calibrated('a')
     request = CalibrationRequest({'a': exposures()['a']}, rig().phantom)
     held = adjust_with_calibrations(request.frames, request.phantom, whole.calibrations)
@@ -384,7 +384,7 @@ def test_part_from_the_solution_is_that_from_observations_alone():
 
 
 def test_difference_ignores_what_orientations_absorb():
-    """A calibration whose rays are turned, shifted, scaled and tilted predicts the same."""
+    """A calibration with rays rotated, shifted, scaled and tilted gives the same predictions."""
     one = calibrated('a', **LOCAL).calibrations['a']
     model = one.model
     (xp, yp, c) = one.interior
@@ -423,8 +423,8 @@ def test_place_names():
 
 
 def test_false_alarm_rate_of_white_residuals():
-    """Also with an offset and turn of every exposure, which a test of single residuals would not
-    bear.
+    """Also with an offset and rotation of every exposure, with which a test of single residuals
+    would fail.
     """
 
     def of_exposure(uv, e):
@@ -441,7 +441,7 @@ def test_false_alarm_rate_of_white_residuals():
         ):
             alarms[2 * i] += trend.size > trend.limit
             alarms[2 * i + 1] += trend.cell_size > trend.cell_limit
-    # 100 draws at a rate of 0.2 %: four or more come once in 100,000 tests.
+    # At a rate of 0.2 %, four or more of 100 draws occur once in 100,000 tests.
     assert FALSE_ALARM == 2e-3 and alarms.max() <= 3
 
 
@@ -471,7 +471,7 @@ def test_change_of_trend_is_detected_with_its_size():
 
 @pytest.mark.parametrize('middle', [(448.0, 448.0), (512.0, 512.0)])
 def test_local_change_is_found_wherever_it_is(middle):
-    """In the middle of a cell and where four of them meet; noise alone is far from the limit."""
+    """In the middle of a cell and where four cells meet; noise alone stays far below the limit."""
 
     def ripple(uv, e):
         bump = np.exp(-np.sum((uv - middle) ** 2, axis=1) / (2 * 60.0**2))
@@ -503,7 +503,7 @@ def test_residuals_agree_with_the_adjustment():
 
 
 def phantom_with_a_wrong_bead(mm=3.0):
-    """The survey of the rig with a bead out of place, and its id."""
+    """The survey of the rig with one displaced bead, and the id of that bead."""
     phantom = rig().phantom
     seen = np.bincount(np.concatenate([f.target_id for f in exposures()['a']]), minlength=504)
     row = int(np.flatnonzero(seen[phantom.target_id] >= 6)[3])
@@ -518,11 +518,11 @@ def test_bead_with_a_wrong_survey_is_reported_with_its_error():
     job = calibrate(frames, phantom, CalibrationOptions(max_iterations=6, **LOCAL))
     held = adjust_with_calibrations(frames, phantom, job.calibrations)
     beads, dist = compare_with_survey(intersect(held, frames, phantom))
-    # It is out of place whichever ray is left out.
+    # The bead is displaced whichever ray is excluded.
     assert least_chi2_without_a_ray(held, frames, phantom, np.array([wrong]))[0] > 100
     assert beads.passed is False and beads.place.target_id == (wrong,)
     assert abs(beads.value - 3.0) < 0.4 and beads.limit < 1.5
-    assert dist.passed  # without the bead that is named
+    assert dist.passed  # the named bead is excluded
 
 
 def test_a_bead_that_one_ray_puts_out_of_place_is_not_accused():
@@ -539,7 +539,7 @@ def test_a_bead_that_one_ray_puts_out_of_place_is_not_accused():
 
 
 def table_of(target_id, outlier, exposure=None):
-    """Residual table of one fluoroscope, as far as rejected beads need it."""
+    """Residual table of one fluoroscope, with the columns that rejected_beads needs."""
     count = len(target_id)
     exposure = np.zeros(count, dtype=int) if exposure is None else exposure
     name = np.full(count, 'a')
@@ -549,10 +549,10 @@ def table_of(target_id, outlier, exposure=None):
 
 
 def test_a_bead_of_which_nearly_all_points_are_rejected_is_doubted():
-    """Unless false matches are so frequent that chance does it."""
+    """No doubt arises if false matches are so frequent that chance explains it."""
     target_id = np.repeat(np.arange(100), 4)
     outlier = np.zeros(400, dtype=bool)
-    outlier[:5] = [True, True, True, False, True]  # three of bead 0, one of bead 1
+    outlier[:5] = [True, True, True, False, True]  # three points of bead 0, one of bead 1
     assert rejected_beads(table_of(target_id, outlier)).tolist() == [0]
     rng = np.random.default_rng(1)
     for share in (0.01, 0.2, 0.4):
@@ -562,7 +562,7 @@ def test_a_bead_of_which_nearly_all_points_are_rejected_is_doubted():
 
 
 def test_beads_that_two_exposures_show_are_doubted_together():
-    """All image points of one such bead are rejected by chance, those of three are not."""
+    """By chance, all points of one such bead may be rejected, but not those of three."""
     target_id = np.repeat(np.arange(400), np.where(np.arange(400) < 40, 2, 6))
     exposure = np.arange(len(target_id)) % 17
     chance = np.random.default_rng(2).random(len(target_id)) < 0.01
@@ -618,7 +618,7 @@ def test_distances_give_scale_and_precision():
 
 
 def test_distances_of_few_beads_scatter_as_expected():
-    """Good surveys of a small phantom fail by chance as rarely as those of a large one."""
+    """By chance, good surveys of a small phantom fail as rarely as those of a large one."""
     rng = np.random.default_rng(1)
     n = 20
     survey = rng.uniform(-60, 60, (n, 3))
@@ -656,7 +656,7 @@ def test_too_few_beads():
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """A folder that calibrate has written: fluoroscope a, six exposures, few rounds."""
+    """A folder written by calibrate: fluoroscope a, six exposures, few rounds."""
     place = tmp_path_factory.mktemp('validate')
     root = pathlib.Path(__file__).resolve().parents[2] / 'bags'
     lines = (root / 'calibration.csv').read_text().splitlines()
@@ -694,7 +694,7 @@ def copied(folder, to):
 
 
 def test_sources_round_trip(tmp_path):
-    """Also of fluoroscopes with images of different size."""
+    """Also with fluoroscopes of different image sizes."""
     job = calibrated('a', **LOCAL)
     frames = exposures()['a']
     calibration = job.calibrations['a']
@@ -822,7 +822,7 @@ def test_table_fits_a_terminal_and_gives_advice():
 
 
 def test_imprecise_correction_does_not_pass(monkeypatch):
-    """A neighbour model that follows the noise: 50 % larger errors than with known distortion."""
+    """A neighbour model that follows the noise: errors 50 % above those with known distortion."""
     monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     few_rounds = {'model': 'knn', 'max_iterations': 4}
     job = calibrated(count=8, **few_rounds)
@@ -838,7 +838,7 @@ def test_imprecise_correction_does_not_pass(monkeypatch):
 
 
 def test_model_that_does_not_follow_the_distortion_is_named(monkeypatch):
-    """Its misfit is no noise of the image, beside which a correction would seem precise."""
+    """Its misfit is not image noise, next to which the correction would look precise."""
     monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     job = calibrated('a', model='parametric')
     request = CalibrationRequest(

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Input that cannot be right is refused with its cause, before and after the calibration.
+"""Input that cannot be correct is refused with its cause, before and after the calibration.
 
-The table is the contract: wrong input, and the kind of what is found. What is right but difficult
-must pass.
+The table is the contract: wrong input and the kind of its finding. Input that is correct but
+difficult must pass.
 """
 
 import functools
@@ -42,7 +42,7 @@ PHANTOM = rig().phantom
 
 @functools.cache
 def recording(count, **options):
-    """Exposures of the fluoroscopes, every third target of them; options of a Detection."""
+    """Exposures of the fluoroscopes with every third target; options: those of Detection."""
     made = simulate_exposures(rig(), count, 1, Detection(**options)).frames if options else None
     return {
         name: [thinned(f) if len(f.uv) > 100 else f for f in of_one[:count]]
@@ -61,7 +61,7 @@ def frames(count=6, **options):
 
 
 def relabelled(relabel, seen=None):
-    """The exposures with other ids, those that the phantom does not have left out."""
+    """The exposures with other ids; ids that the phantom does not have are dropped."""
     out = []
     for frame in seen or frames():
         ids = relabel(frame.target_id)
@@ -71,7 +71,7 @@ def relabelled(relabel, seen=None):
 
 
 def shuffled(share):
-    """The exposures with a share of their ids interchanged."""
+    """The exposures with a share of their ids permuted."""
 
     def relabel(ids):
         rng = np.random.default_rng(len(ids))
@@ -84,23 +84,23 @@ def shuffled(share):
 
 
 def mapped(change, image_size=(1024, 1024)):
-    """The exposures with other image points."""
+    """The exposures with transformed image points."""
     return [replace(f, uv=change(f.uv), image_size=image_size) for f in frames()]
 
 
 def scaled(factor):
-    """The phantom in another unit."""
+    """The phantom in a different unit."""
     return Phantom(PHANTOM.target_id, factor * PHANTOM.xyz_mm, factor * PHANTOM.sd_mm)
 
 
 def other_phantom(seed=2):
-    """Another phantom with the same ids."""
+    """A different phantom with the same ids."""
     other = virtual_rig(seed).phantom
     return Phantom(PHANTOM.target_id, other.xyz_mm, PHANTOM.sd_mm)
 
 
 def permuted_axes():
-    """The phantom with x and y interchanged: a mirror image of it."""
+    """The phantom with x and y interchanged, which is its mirror image."""
     return Phantom(PHANTOM.target_id, PHANTOM.xyz_mm[:, [1, 0, 2]], PHANTOM.sd_mm)
 
 
@@ -193,9 +193,9 @@ WRONG = {
 
 
 def placed(count, place):
-    """The phantom with some targets where a program puts those that are not surveyed.
+    """The phantom with some targets at the fill value of a program for unsurveyed ones.
 
-    They are the first ones that are seen.
+    These are the visible targets with the smallest ids.
     """
     xyz = PHANTOM.xyz_mm.copy()
     seen = np.unique(np.concatenate([f.target_id for f in frames()]))[:count]
@@ -203,7 +203,7 @@ def placed(count, place):
     return Phantom(PHANTOM.target_id, xyz, PHANTOM.sd_mm)
 
 
-# How many targets are named, and the kind.
+# Kind of the finding, and number of targets that it names.
 WRONG_PHANTOM = {
     'two targets in one place': (lambda: placed(2, [1, 2, 3]), Kind.REPEATED_COORDINATES, 2),
     '20 targets at the origin': (lambda: placed(20, 0), Kind.REPEATED_COORDINATES, 20),
@@ -225,7 +225,7 @@ def test_targets_that_no_survey_has_are_refused(case):
 
 
 def partly(share, factor, seed=4):
-    """The phantom with a share of its targets in another unit; also which."""
+    """The phantom with a share of its targets in another unit, and a mask of these targets."""
     ids = PHANTOM.target_id
     which = np.random.default_rng(seed).permutation(len(ids)) < share * len(ids)
     xyz = np.where(which[:, None], factor * PHANTOM.xyz_mm, PHANTOM.xyz_mm)
@@ -282,7 +282,7 @@ def test_an_exposure_that_two_fluoroscopes_share_is_left_out_of_both():
 
 @pytest.mark.parametrize('shared', [2, 3])
 def test_up_to_a_third_of_the_exposures_may_be_shared(shared):
-    """Of six; with more, one recording has been given for both."""
+    """The limit holds for six; if more are shared, one recording was given for both."""
     seen = {name: list(of_one)[:6] for name, of_one in recording(8).items()}
     seen['b'][:shared] = [replace(one, fluoroscope='b') for one in seen['a'][:shared]]
     if shared == 3:
@@ -327,7 +327,7 @@ def test_a_principal_distance_in_mm_is_refused():
 
 @pytest.mark.parametrize('case', WRONG)
 def test_wrong_input_is_refused_with_its_cause(case, monkeypatch):
-    # In vain here.
+    # The search for mixed units is in vain here, so make it short.
     monkeypatch.setattr('fluoro_calib_ros.checks.mixed_units.SAMPLES', 300)
     monkeypatch.setattr('fluoro_calib_ros.checks.mixed_units.STEPS', 2)
     make_frames, make_phantom, kind = WRONG[case]
@@ -338,12 +338,12 @@ def test_wrong_input_is_refused_with_its_cause(case, monkeypatch):
 
 
 def with_sigma(value):
-    """The exposures with sigma given."""
+    """The exposures with a given sigma."""
     return [replace(f, sigma=np.full(len(f.target_id), value)) for f in frames()]
 
 
 def flattened(count):
-    """The exposures with the image points of some of them on one line."""
+    """The exposures, with the image points of some of them on one line."""
     out = frames()
     out[:count] = [
         replace(f, uv=np.column_stack([f.uv[:, 0], np.full(len(f.uv), 500.0)]))
@@ -353,7 +353,7 @@ def flattened(count):
 
 
 def survey(xyz_mm=None, sd_mm=None):
-    """The phantom with other coordinates or standard deviations."""
+    """The phantom with different coordinates or standard deviations."""
     return Phantom(
         PHANTOM.target_id,
         PHANTOM.xyz_mm if xyz_mm is None else xyz_mm,
@@ -416,7 +416,7 @@ def test_exposure_on_a_line_does_not_affect_the_others():
 
 
 def barrel(uv, strength_px):
-    """Another distortion than that of the simulation: a radial barrel."""
+    """A distortion that differs from that of the simulation: a radial barrel."""
     x = (uv - 511.5) / 512
     return uv - strength_px * x * np.sum(x * x, axis=1, keepdims=True)
 
@@ -445,7 +445,7 @@ def test_difficult_input_is_accepted(kind):
 
 @pytest.mark.parametrize('seed', range(6))
 def test_few_targets_with_false_matches_have_one_unit(seed):
-    """Multiples alone are the phantom, larger and farther away."""
+    """The multiples alone look like the same phantom, larger and farther away."""
     rng = np.random.default_rng(seed)
     thin = []
     for frame in frames():
@@ -472,7 +472,7 @@ def test_random_rigs_with_strong_distortion_are_accepted(seed):
     ],
 )
 def test_wide_angle_is_no_wrong_unit(distance, extent, kind):
-    """The distance of the source over the size of the phantom is the same in any unit."""
+    """The ratio of source distance and phantom size does not depend on the unit."""
     corners = np.array([[0.0, 0, 0], [0, 1, 0], [0, 0.5, 0], [0, 0.2, 0]])
     phantom = Phantom(np.arange(4), extent * corners, np.full(4, 0.1))
     found = wrong_unit(distance, phantom)
@@ -481,7 +481,7 @@ def test_wide_angle_is_no_wrong_unit(distance, extent, kind):
 
 @pytest.mark.long
 def test_stretched_image_is_accepted():
-    """A far principal point, with a turn of the sensor, takes up the stretch to second order."""
+    """A distant principal point with a rotated sensor absorbs the stretch to second order."""
     stretched = mapped(lambda uv: 511.5 + (uv - 511.5) * [0.99, 0.91])
     outcome = run_calibration(CalibrationRequest({'a': stretched}, PHANTOM, CalibrationOptions()))
     figures = outcome.result.fluoroscopes['a']
@@ -509,7 +509,7 @@ def test_few_wrong_exposures_are_left_out_and_named():
 )
 def test_the_cause_of_exposures_that_are_left_out_is_named(change, kind):
     seen = frames(8)
-    last = seen[4].target_id < PHANTOM.target_id[-1]  # which has a next one
+    last = seen[4].target_id < PHANTOM.target_id[-1]  # those that have a next id
     seen[4] = change(replace(seen[4], target_id=seen[4].target_id[last], uv=seen[4].uv[last]))
     outcome = run_calibration(CalibrationRequest({'a': seen}, PHANTOM, FAST))
     (found,) = outcome.result.findings
@@ -518,7 +518,7 @@ def test_the_cause_of_exposures_that_are_left_out_is_named(change, kind):
 
 
 def test_exposures_of_which_less_than_half_fits_are_left_out_and_named():
-    """Beads labelled as ones nearby: the exposure starts well, but most of it does not fit."""
+    """Beads have ids of neighbours: the exposure starts well, but most of it does not fit."""
     strong = virtual_rig(1, 2.0)
     good = simulate_exposures(strong, 5, 1).frames['a']
     wrong = simulate_exposures(strong, 6, 1, Detection(false_matches=0.52)).frames['a'][5]
@@ -530,7 +530,7 @@ def test_exposures_of_which_less_than_half_fits_are_left_out_and_named():
 
 
 def test_single_points_that_cannot_be_used_are_left_out_and_counted(tmp_path, capsys):
-    """A point off the image and an unknown id, in Python and by the command."""
+    """A point off the image and an unknown id, in Python and with the command."""
     seen = frames()
     uv = seen[0].uv.copy()
     uv[3, 0] = 1024.2
@@ -574,7 +574,7 @@ def test_interchanged_fluoroscopes_are_found():
 
 @pytest.mark.parametrize('depth_mm', [0.0, 4.0, 12.0])
 def test_few_targets_of_a_facade_start_near_the_truth(depth_mm):
-    """13 targets nearly in a plane, one exposure among full ones: a DLT may be far off."""
+    """13 nearly coplanar targets, one exposure among complete ones: a DLT may be far off."""
     fluoroscope = rig().fluoroscopes[0]
     rng = np.random.default_rng(3)
     facade = rng.uniform(-1, 1, (13, 3)) * [100, 80, depth_mm / 2]
@@ -613,7 +613,7 @@ def test_forced_input_is_validated_without_a_traceback(kind):
 
 @pytest.mark.long
 def test_impossible_result_is_refused_unless_forced():
-    """More than half of the beads have the ids of neighbours, and bend the result."""
+    """More than half of the beads have the ids of neighbours and distort the result."""
     request = CalibrationRequest({'a': frames(10, false_matches=0.55)}, PHANTOM, FAST)
     with refused(Kind.LARGE_RESIDUALS):
         run_calibration(request)
@@ -634,7 +634,7 @@ def test_result_is_good_where_nearly_half_of_the_beads_have_the_ids_of_neighbour
 
 @pytest.mark.long
 def test_frames_that_do_not_belong_together_give_no_orientation():
-    """Fluoroscope b is one exposure behind a: both are calibrated well, the rig is not rigid."""
+    """Fluoroscope b is one exposure late: both calibrations are good, but the rig is not rigid."""
     seen = {n: list(f[:8]) for n, f in exposures().items()}
     seen['b'] = [replace(f, number=f.number + 1) for f in seen['b']]
     outcome = run_calibration(CalibrationRequest(seen, PHANTOM, FAST))
@@ -675,7 +675,7 @@ def test_the_command_refuses_wrong_input_and_writes_it_only_when_forced(tmp_path
 
 
 def test_largest_exposures_are_tried_for_a_cause_first(monkeypatch):
-    """Where these have none, the others are not tried; where most have one, all are."""
+    """If these show none, others are not tried; if most show one, all are tried."""
     shown = [SimpleNamespace(target_id=range(n)) for n in range(1, 3 * inputs.MAX_TESTED)]
     for found, tried in (('', inputs.MAX_TESTED), ('mirrored', len(shown))):
         sizes = []

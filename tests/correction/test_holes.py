@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated area ends where no target was seen, within the image, too."""
+"""The calibrated area ends where no target was seen, also inside the image."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ RADIUS = 140.0
 
 
 def model(count=2000, hole=True, seed=1):
-    """A smooth correction, trained without points in a disc."""
+    """A smooth correction, trained without points inside a disc."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(0, SIDE - 1, (count, 2))
     if hole:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of a correction: what an angle adds, neighbours that are tried, errors of its cells."""
+"""Parts of a correction: change with the angle, candidate neighbours, and errors of its cells."""
 
 from dataclasses import replace
 
@@ -64,7 +64,7 @@ def test_angle_adds_its_change_and_variance_to_the_correction():
     ],
 )
 def test_content_that_is_no_correction_is_refused(kind, k, changed):
-    """A damaged file or message gives no model, rather than one that corrects by garbage."""
+    """A damaged file or message yields no model instead of one that corrects by garbage."""
     content = {'train_uv': UV, 'train_duv': np.zeros((30, 2))}
     for possible in (1, 30):
         assert create_model('knn', possible, **content).k == possible
@@ -82,7 +82,7 @@ def test_neighbours_that_are_tried_reach_from_three_to_forty_percent(count, firs
 
 @pytest.mark.parametrize('affordable', [10**9, 60])
 def test_errors_of_cells_are_those_of_the_interpolation_at_their_places(affordable):
-    """By loops; where few values are affordable, of the most curved cells."""
+    """Reference: loops. If few values are affordable, the most curved cells are measured."""
     model = pincushion('a', SIZE).model
     columns, rows = np.linspace(0, 300, 9), np.linspace(10, 230, 7)
     corners = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -121,19 +121,19 @@ def test_sines_of_a_series_are_counted_along_the_longer_side():
 
 
 def test_cells_are_divided_by_how_far_they_miss_the_target():
-    """Once more than halving would need; their coefficients are those of the model's values."""
+    """Cells are halved once more than needed; coefficients are those of the model's values."""
     model = pincushion('a', SIZE).model
     cells = build_cells(model, SIZE)
     errors = np.zeros_like(cells.errors)
     for (row, column), error in {(2, 5): 0.9, (3, 4): 1.9, (7, 1): 3.9, (8, 8): 1e6}.items():
         errors[0, row, column] = error * TARGET_PX
-    errors[1] = 99.0  # of the standard deviation, which is no reason
+    errors[1] = 99.0  # error of the standard deviation, which must not cause a division
     divided = divide_cells(model, replace(cells, errors=errors))
     assert list(zip(divided.row, divided.column)) == [(3, 4), (7, 1), (8, 8)]
     assert divided.parts.tolist() == [4, 8, MAX_PARTS]
     assert divided.first.tolist() == [0, 16, 80] and len(divided.table) == 80 + MAX_PARTS**2
     columns, rows = cells.nodes
-    part = 1  # the second one of the first row, of cell (3, 4)
+    part = 1  # second part in the first row of cell (3, 4)
     step = (columns[5] - columns[4]) / 4, (rows[4] - rows[3]) / 4
     u, v = columns[4] + part * step[0], rows[3]
     places = np.array([[u, v], [u + step[0], v], [u, v + step[1]], [u + step[0], v + step[1]]])
@@ -240,7 +240,7 @@ def test_bands_without_coefficients_are_left_out():
 def test_nearest_training_points_of_a_block_are_among_its_candidates(most):
     rng = np.random.default_rng(8)
     points = rng.uniform(0, 300, (500, 2))
-    points[:80] = points[0]  # coincide: too many
+    points[:80] = points[0]  # coincide: too many for one query
     uv = rng.uniform(0, 300, (400, 2))
     tree = cKDTree(points)
     distance = tree.query(uv, k=7)[0][:, -1]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A correction to which a change is added."""
+"""A correction plus a change of it."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def random_series(seed, functions, sd):
 
 
 def test_sum_of_series_is_the_sum_of_their_corrections():
-    """Of other degrees and numbers of sines, and of radial polynomials; errors are independent."""
+    """Degrees, numbers of sines and radial polynomials differ; the errors are independent."""
     one = random_series(1, Functions(SIZE, 2, 7, rings=1), 0.3)
     other = random_series(2, Functions(SIZE, 3, 4), 0.4)
     uv = np.random.default_rng(3).uniform(0, 1023, (50, 2))
@@ -50,7 +50,7 @@ def test_calibration_with_a_drift_corrects_by_it_too():
 
 
 def test_calibration_with_a_larger_standard_deviation_corrects_as_before():
-    """It claims the larger of both; a second time, or of a model that has none, it is the same."""
+    """The larger sd applies; a repetition, or a model without sd, changes nothing."""
     calibration = calibrated('a', 6, max_iterations=2).calibrations['a']
     sd = np.linspace(0, 2 * calibration.model.series.sd.max(), SD_GRID**2).reshape(SD_GRID, -1)
     changed = with_larger_sd(calibration, sd)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A new model is one file and one line in the registry: the example of docs/models.md."""
+"""Adding a model takes one file and one registry entry, as the example of docs/models.md shows."""
 
 import importlib.util
 import re
@@ -24,7 +24,7 @@ NAME = 'inverse_distance'
 
 @pytest.fixture
 def added(tmp_path, monkeypatch):
-    """The model of the documentation, written to a file and entered in the registry."""
+    """The example model of docs/models.md, written to a file and registered."""
     blocks = re.findall(r'```python\n(.*?)```', DOCUMENT.read_text(), re.S)
     (code,) = (block for block in blocks if f"kind = '{NAME}'" in block)
     path = tmp_path / f'{NAME}.py'
@@ -75,7 +75,7 @@ def test_added_model_is_in_the_help_of_the_command(capsys):
 
 @pytest.mark.usefixtures('added')
 def test_options_declare_an_added_model():
-    """Parameters of nodes, config and documentation are made from the declaration."""
+    """Node parameters, configuration and documentation are generated from the declaration."""
     assert NAME in declared(CalibrationOptions)['model'].choices
 
 

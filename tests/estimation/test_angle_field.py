@@ -23,7 +23,7 @@ ANGLES = np.deg2rad([-80.0, -50.0, -35.0, -10.0, 5.0, 30.0, 60.0, 85.0])
 
 
 def field(seed=0):
-    """An AngleField of random content."""
+    """An AngleField with random coefficients."""
     rng = np.random.default_rng(seed)
     root = rng.normal(0, 0.1, (HARMONICS, HARMONICS))
     covariance = root @ root.T
@@ -112,11 +112,11 @@ def test_damaged_content_is_refused(name):
             replace(found, **{name: wrong})
 
 
-# ---- on the virtual rig: a field that turns with the C-arm
+# ---- on the virtual rig: a field that changes with the C-arm angle
 
 
 def rmse_of_test(calibration, frames):
-    """RMSE [px] of exposures that were not used."""
+    """RMSE [px] of exposures that were not used for the calibration."""
     job = adjust_with_calibrations({'a': frames}, rig().phantom, {'a': calibration})
     return float(np.linalg.norm(job.fluoroscopes['a'].rmse_after))
 
@@ -140,7 +140,7 @@ def test_change_is_found_and_stated():
     one, other = (calibration.correction(uv, angle) for angle in angles)
     true = turned(uv, angles[1], calibration.image_size)
     true = true - turned(uv, angles[0], calibration.image_size)
-    # What a turn of the sensor does, the orientations of the exposures take up.
+    # The orientations of the exposures absorb the effect of a sensor rotation.
     error = other.duv - one.duv - true
     x, y = (uv - 511.5).T / 512
     zero = np.zeros_like(x)
@@ -148,7 +148,7 @@ def test_change_is_found_and_stated():
     basis = np.stack([np.stack(t, axis=1) for t in turns], axis=2).reshape(-1, len(turns))
     left = error.ravel() - basis @ np.linalg.lstsq(basis, error.ravel(), rcond=None)[0]
     assert np.sqrt(np.mean(left**2)) < 0.12
-    assert 0.1 * CHANGE_PX < found.size_px < 0.5 * CHANGE_PX  # it is that at the corners
+    assert 0.1 * CHANGE_PX < found.size_px < 0.5 * CHANGE_PX  # CHANGE_PX is that at the corners
 
 
 @pytest.mark.long

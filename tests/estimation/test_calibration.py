@@ -43,8 +43,8 @@ NOISE_PX = 0.25
 
 
 def field_error(job, name='a'):
-    """RMS difference [px] of the correction from the true distortion in the calibrated area,
-    without the gauge.
+    """RMS difference [px] between correction and true distortion, without the gauge, inside the
+    calibrated area.
     """
     calibration = job.calibrations[name]
     fluoroscope = next(f for f in rigs.rig().fluoroscopes if f.name == name)
@@ -69,7 +69,7 @@ def target_error(targets):
 
 
 def frames_of(name='a', count=15):
-    """Frames by fluoroscope, in lists of their own."""
+    """The frames of each fluoroscope, in new lists."""
     return {name: list(rigs.exposures()[name][:count])}
 
 
@@ -113,15 +113,15 @@ def assert_same_bits(one, other):
 
 @pytest.mark.long
 def test_self_calibration_estimates_the_distortion():
-    """15 exposures: it converges, the residuals are noise, the correction and the object points
+    """15 exposures: the calibration converges, residuals are noise, correction and object points
     are near the truth.
     """
     job = rigs.calibrated()
     figures = job.fluoroscopes['a']
     assert job.converged and job.findings == ()
     assert (figures.rmse_before > 4 * NOISE_PX).all()
-    # Raw residuals are smaller than the noise by the root of their redundancy, here about two
-    # thirds.
+    # Raw residuals are smaller than the noise by the square root of their redundancy, here about
+    # two thirds.
     assert (figures.rmse_after > 0.6 * NOISE_PX).all() and (figures.rmse_after < NOISE_PX).all()
     assert figures.inliers > 0.97 * figures.observations > 15 * 125
     assert field_error(job) < 0.13
@@ -134,10 +134,10 @@ def test_self_calibration_estimates_the_distortion():
 @pytest.mark.long
 def test_local_linear_is_more_accurate_than_knn():
     knn = rigs.calibrated(model='knn')
-    # Its steps make heavy tails, which are not taken for gross errors.
+    # The steps of knn cause heavy tails, which must not be mistaken for gross errors.
     assert knn.fluoroscopes['a'].rmse_after.max() < 1.2 * NOISE_PX
     assert 2.5 * field_error(rigs.calibrated()) < field_error(knn) < 1.2
-    # What it cannot follow is in the claims of the object points.
+    # The covariances of the object points contain what knn cannot follow.
     targets = knn.targets
     offset = targets.xyz_mm - rigs.rig().true_mm[PHANTOM.index(targets.target_id)]
     variance = np.diagonal(targets.covariance, axis1=1, axis2=2)
@@ -156,8 +156,8 @@ def test_without_a_model_there_is_one_round():
 
 
 def test_calibration_corrects_unused_exposures():
-    """With the calibration held, the residuals are near the noise and the calibration does not
-    change.
+    """With the calibration fixed, the residuals are near the noise level and the calibration stays
+    unchanged.
     """
     test = simulate_exposures(rigs.rig(), 8, seed=77, start=StreamStart(number=100)).frames['a']
     calibration = rigs.calibrated().calibrations['a']
@@ -166,7 +166,7 @@ def test_calibration_corrects_unused_exposures():
     assert (figures.rmse_before > 4 * NOISE_PX).all() and (figures.rmse_after < NOISE_PX).all()
     np.testing.assert_array_equal(figures.interior, calibration.interior)
     assert job.calibrations['a'] is calibration
-    # Held, but as uncertain as it is.
+    # The interior orientation is fixed, but its uncertainty is propagated.
     interior_sd = np.sqrt(np.diag(calibration.interior_covariance))
     np.testing.assert_allclose(figures.interior_sd, interior_sd, rtol=0.05)
     assert [e.exposure for e in figures.exposures] == list(range(100, 108))
@@ -182,13 +182,13 @@ def test_a_single_exposure_can_be_adjusted():
         {'a': test}, PHANTOM, {'a': rigs.calibrated().calibrations['a']}
     )
     assert job.converged and len(job.fluoroscopes['a'].exposures) == 1
-    # With one ray to a target the survey could take up all residuals: the noise is that of the
+    # With one ray per target the survey could absorb all residuals, so the noise is taken from the
     # calibration.
     assert job.fluoroscopes['a'].rmse_after.min() > 0.05 and target_error(job.targets) < 0.1
 
 
 def test_adjustment_refuses_frames_of_another_image_size():
-    """The correction is a function of the pixels of its own image."""
+    """A correction is valid only for pixels of its own image size."""
     other = [replace(frame, image_size=(2048, 1024)) for frame in frames_of()['a']]
     with pytest.raises(
         DataError,
@@ -215,7 +215,7 @@ def test_joint_adjustment_has_common_object_points():
     assert not np.array_equal(joint.fluoroscopes['a'].interior, apart.fluoroscopes['a'].interior)
 
 
-# ---- the loop
+# ---- the iteration
 
 
 @pytest.mark.parametrize('model', ['auto', 'local_linear', 'hybrid', 'knn', 'parametric'])
@@ -239,12 +239,12 @@ def test_fitted_correction_is_orthogonal_to_the_gauge(model):
 
 
 def test_adjustment_and_model_are_of_the_same_round():
-    """The correction held in the last adjustment is that of the model; the last round reports its
-    cost.
+    """The correction fixed in the last adjustment is that of the model, and the last round reports
+    its cost.
     """
     job = rigs.calibrated()
     run = job.runs['a']
-    # Terms of the trend that are absent in the model have a variance of 1e-8 in the adjustment.
+    # Trend terms that the model does not contain have a prior variance of 1e-8 in the adjustment.
     np.testing.assert_allclose(
         run.models['a'].predict(run.measured.network.uv), run.correction, atol=1e-6
     )
@@ -261,7 +261,7 @@ def test_adjustment_and_model_are_of_the_same_round():
 
 @pytest.mark.long
 def test_convergence_follows_the_tolerance():
-    """F and G change by less than the tolerance in the last round, and by more before."""
+    """F and G change by less than the tolerance in the last round only."""
     history = rigs.calibrated(count=6, model='local_linear').history['a']
 
     def change(now, before):
@@ -291,7 +291,7 @@ def test_progress_is_reported_after_every_round():
 
 
 def test_a_progress_that_raises_stops_a_calibration():
-    """No round follows the call that raises."""
+    """No round follows the call of `progress` that raises."""
     told = []
 
     class Stop(Exception):
@@ -323,8 +323,7 @@ def test_options_reach_the_calculation(options):
     assert run.after.noise.loss == options.get('loss', 'student_t')
     assert run.after.cost != plain.runs['a'].after.cost
     assert all(r.k['a'] == options['k'] for r in run.history if 'k' in options)
-    # Least squares are spoilt by the false matches; all others have their residuals down after two
-    # rounds.
+    # False matches spoil least squares; all other options reduce the residuals within two rounds.
     if options != {'loss': 'gaussian'}:
         assert (job.fluoroscopes['a'].rmse_after < 0.5 * job.fluoroscopes['a'].rmse_before).all()
 
@@ -346,7 +345,7 @@ def test_unknown_options_are_refused(options):
 
 
 def test_fixed_interior_orientation_is_held_and_the_model_compensates():
-    """Image centre and given principal distance to the last bit, without standard deviation."""
+    """Image centre and given principal distance stay exact and have no standard deviation."""
     job = calibrate(
         frames_of(count=6), PHANTOM, rounds(2, interior='fixed'), principal_distance=4000.0
     )
@@ -362,9 +361,7 @@ def test_fixed_interior_orientation_is_held_and_the_model_compensates():
 
 
 def test_principal_distance_is_only_a_start_value():
-    """Whether given or derived from the observations, the estimated interior orientation is the
-    same.
-    """
+    """The estimated interior orientation is the same for a given and a derived initial value."""
     measured = measured_network(frames_of(), PHANTOM, principal_distance=3900.0)
     np.testing.assert_array_equal(
         measured.start.interior, [nominal_interior((1024, 1024), 3900.0)]
@@ -384,8 +381,8 @@ def test_principal_distance_is_only_a_start_value():
 
 
 def test_start_values_are_near_the_truth():
-    """Resected exterior orientations are as near the truth as the distortion allows, in every
-    exposure.
+    """In every exposure, the resected orientation is as close to the truth as the distortion
+    allows.
     """
     frames = frames_of()
     simulated = simulate_exposures(rigs.rig(), 15, 1)
@@ -394,7 +391,7 @@ def test_start_values_are_near_the_truth():
     for row, pose in enumerate(simulated.poses):
         rotation, position = fluoroscope.exterior(pose)
         assert rotation_angle(measured.start.rotation[row] @ rotation.T) < np.deg2rad(1.5)
-        # Along the axis the distance follows the principal distance found.
+        # Along the optical axis, the distance depends on the estimated principal distance.
         assert np.linalg.norm(measured.start.position_mm[row] - position) < 100
 
 
@@ -404,7 +401,7 @@ def test_exterior_orientations_are_those_of_the_rig():
     poses = simulate_exposures(rigs.rig(), 15, 1).poses
     for found, pose in zip(rigs.calibrated().fluoroscopes['a'].exposures, poses, strict=True):
         rotation, position = fluoroscope.exterior(pose)
-        # The principal point, and with it the attitude, is known to the gauge only.
+        # The principal point, and with it the attitude, is only determined up to the gauge.
         assert rotation_angle(
             matrix_from_quaternion(found.quaternion_wxyz) @ rotation.T
         ) < np.deg2rad(2)
@@ -422,7 +419,7 @@ def test_same_observations_give_the_same_bits():
 @pytest.mark.parametrize('options', [{}, {'model': 'local_linear', 'k': 60}])
 @pytest.mark.long
 def test_order_of_frames_and_targets_does_not_matter(options):
-    """To the last bit, also over accelerated rounds."""
+    """Results agree to the last bit, also with accelerated rounds."""
     rng = np.random.default_rng(1)
     frames = frames_of(count=6)['a']
     shuffled = []
@@ -455,8 +452,8 @@ def test_sigma_of_one_changes_nothing():
 
 
 def test_observations_are_weighted_by_sigma():
-    """Every other exposure is blurred by 2.5 px, which only sigma shows: object points are more
-    accurate with it.
+    """Every other exposure is blurred by 2.5 px. Weights by sigma make the object points more
+    accurate.
     """
     straight = virtual_rig(1, strength=0.0)
     frames = simulate_exposures(straight, 15, 1, detection=Detection(false_matches=0.0)).frames[
@@ -496,7 +493,7 @@ def with_value(frame, value):
 
 
 def one_pose(frames):
-    """Repeat the first exposure with new noise."""
+    """Five copies of the first exposure with new noise."""
     rng = np.random.default_rng(3)
     return [
         replace(frames[0], number=n, uv=frames[0].uv + rng.normal(0, 0.2, frames[0].uv.shape))
@@ -555,7 +552,7 @@ def shuffled_ids(frame, seed=4):
     ],
 )
 def test_insufficient_observations_are_refused(spoil, said):
-    """One sentence with the fluoroscope, the exposure where it helps, and the cause."""
+    """The finding names the fluoroscope, the cause and, where it helps, the exposure."""
     with pytest.raises(DataError, match=said) as caught:
         calibrate({'a': spoil(frames_of()['a'])}, PHANTOM, rounds(1))
     assert '\n' not in str(caught.value)
@@ -565,7 +562,7 @@ def test_insufficient_observations_are_refused(spoil, said):
     'degrees, mm, accepted', [(5.0, 0.0, True), (0.0, 30.0, True), (1.0, 10.0, False)]
 )
 def test_rotations_and_shifts_make_different_poses(degrees, mm, accepted):
-    """Either is enough to begin a calibration; too little of both is one pose."""
+    """Either a rotation or a shift suffices to start; too little of both counts as one pose."""
     fluoroscope = rigs.rig().fluoroscopes[0]
     rng = np.random.default_rng(8)
     frames = []
@@ -584,7 +581,7 @@ def test_rotations_and_shifts_make_different_poses(degrees, mm, accepted):
 
 
 def test_frame_that_does_not_fit_the_phantom_is_left_out_and_reported():
-    """So is a frame with too few targets; the result is that without them."""
+    """So is a frame with too few targets; the result equals that without both frames."""
     frames = frames_of(count=8)['a']
     spoilt = frames[:3] + [shuffled_ids(frames[3])] + frames[4:7] + [cut(frames[7], 9)]
     job = calibrate({'a': spoilt}, PHANTOM, rounds(1))
@@ -606,12 +603,12 @@ def test_fault_of_the_second_fluoroscope_is_reported_with_its_name():
     assert error.value.finding.place == Place(('b',))
 
 
-# ---- what is handed over
+# ---- what a calibration returns
 
 
 def test_calibration_corrects_observed_points():
-    """Undistorted = observed - correction; OK inside, OUTSIDE beyond the calibrated area, INVALID
-    off the image.
+    """Undistorted = observed - correction. Status: OK inside, OUTSIDE beyond the calibrated area,
+    INVALID off the image.
     """
     calibration = rigs.calibrated().calibrations['a']
     fluoroscope = rigs.rig().fluoroscopes[0]
@@ -633,7 +630,7 @@ def test_calibration_corrects_observed_points():
     assert np.isnan(found.uv[3:]).all() and np.isnan(found.sigma[3:]).all()
     own = calibration.correct(uv, np.array([3.0, 0.1, 0.1, 0.1, 0.1, 0.1]))
     np.testing.assert_allclose(own.sigma[:2], np.hypot([3.0, 0.1], model.sd[:2]), rtol=1e-3)
-    # Apart from the gauge the corrected points are the undistorted ones.
+    # Up to the gauge, the corrected points are the undistorted ones.
     grid = np.stack(
         np.meshgrid(np.arange(250, 800, 50.0), np.arange(250, 800, 50.0)), axis=2
     ).reshape(-1, 2)
@@ -649,7 +646,7 @@ def test_calibration_corrects_observed_points():
 def test_calibration_id_depends_on_the_content():
     calibration = rigs.calibrated().calibrations['a']
     assert calibration.calibration_id.startswith('a-')
-    # From a file, without stamps and frame ids, it is the same calibration as from a stream.
+    # Read from a file, without stamps and frame ids, the calibration is the same as from a stream.
     other = replace(calibration, seconds=1.0, stamp_ns=0, frame_id='')
     assert other.calibration_id == calibration.calibration_id
     for changes in (
@@ -686,7 +683,7 @@ def test_calibration_records_its_source():
 
 
 def test_combined_targets_equal_one_estimation():
-    """Two estimates that share the survey, combined, equal one estimate from the survey and both
+    """Combining two estimates that share the survey equals one estimate from the survey and all
     observations.
     """
     rng = np.random.default_rng(5)
@@ -727,7 +724,7 @@ def test_combined_targets_equal_one_estimation():
 
 
 def test_combined_targets_count_the_datum_once():
-    """What the beads of a small phantom have in common is the survey, in both estimates."""
+    """The mean shift of the beads of a small phantom comes from the survey in both estimates."""
     rng = np.random.default_rng(6)
     n = 5
     phantom = replace(
@@ -736,7 +733,7 @@ def test_combined_targets_count_the_datum_once():
         xyz_mm=PHANTOM.xyz_mm[:n],
         sd_mm=np.full(n, 0.1),
     )
-    # Images that show differences of the beads, but not their common shift.
+    # The images show differences between the beads, but not their common shift.
     between = 1e4 * (np.eye(3 * n) - np.kron(np.ones((n, n)), np.eye(3)) / n)
     survey = 100.0 * np.eye(3 * n)
     seen = [phantom.xyz_mm + rng.normal(0, 0.01, (n, 3)) for _ in range(2)]
@@ -758,7 +755,7 @@ def test_combined_targets_count_the_datum_once():
 
 @pytest.mark.parametrize('is_open', [True, False])
 def test_points_without_joint_covariances_count_an_open_datum_once(is_open):
-    """Images show all but shift, turn and scale; where they show a turn, nothing is in common."""
+    """Images show all but shift, turn and scale; if they show a turn, the datum is not open."""
     rng = np.random.default_rng(8)
     n = 60
     sd = rng.uniform(0.05, 0.2, n)
@@ -790,13 +787,13 @@ def test_points_without_joint_covariances_count_an_open_datum_once(is_open):
     else:
         plain = combined_targets(parts, phantom)
         assert both.covariance.tolist() == plain.covariance.tolist()
-    # As if each adjustment had a datum of its own.
+    # As if each adjustment had an independent datum, which underestimates the variances.
     apart = np.trace(combined_targets(parts, phantom).covariance, axis1=1, axis2=2)
     assert np.median(apart / np.trace(truth.covariance, axis1=1, axis2=2)) < 0.7
 
 
 def test_points_of_free_networks_are_combined_without_the_survey():
-    """With joint covariances of all parts or of some: information of beads is added up."""
+    """The information of each bead is added up, with or without joint covariances."""
     rng = np.random.default_rng(7)
     phantom = replace(
         PHANTOM, target_id=np.arange(1, 5), xyz_mm=PHANTOM.xyz_mm[:4], sd_mm=np.full(4, 0.1)
@@ -823,7 +820,7 @@ def test_points_of_free_networks_are_combined_without_the_survey():
 
 @pytest.mark.parametrize('is_joint', [False, True])
 def test_points_that_are_worse_than_the_survey_add_nothing_to_it(is_joint):
-    """As those of a model that cannot follow the distortion are."""
+    """Such points come from a model that cannot follow the distortion."""
     phantom = replace(
         PHANTOM, target_id=np.arange(1, 6), xyz_mm=PHANTOM.xyz_mm[:5], sd_mm=np.full(5, 0.1)
     )
@@ -844,7 +841,7 @@ def test_points_that_are_worse_than_the_survey_add_nothing_to_it(is_joint):
 
 @pytest.mark.long
 def test_parametric_model_finds_terms_that_follow_the_distortion():
-    """With few exposures its tests of significance need the normal matrix at the solution."""
+    """With few exposures, the significance tests need the normal matrix at the solution."""
     found = rigs.calibrated('a', 8, model='parametric').fluoroscopes['a']
     assert max(found.rmse_after) < 0.36
 
@@ -853,9 +850,7 @@ def test_parametric_model_finds_terms_that_follow_the_distortion():
 
 
 def test_anderson_acceleration_is_much_faster_than_plain_iteration():
-    """For a linear contraction by 0.98, thirty rounds gain five digits; the plain iteration gains
-    none.
-    """
+    """For a linear contraction by 0.98, thirty rounds gain five digits, plain iteration none."""
     rng = np.random.default_rng(6)
     turn, _ = np.linalg.qr(rng.normal(size=(40, 40)))
     matrix = turn @ np.diag(np.append(np.linspace(0, 0.5, 36), [0.8, 0.9, 0.95, 0.98])) @ turn.T

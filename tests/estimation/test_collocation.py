@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models that are adjusted with the network: series, collocation, additional parameters, stepwise
-terms, auto.
+"""Models adjusted with the network: series, collocation, additional parameters, stepwise terms,
+auto.
 """
 
 import functools
@@ -106,7 +106,7 @@ SIZE = (1024, 768)
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """As the calibration runs: two threads are slower for matrices of this size."""
+    """Use one thread, as a calibration does: two are slower for matrices of this size."""
     with threadpool_limits(1):
         yield
 
@@ -119,7 +119,7 @@ def pixels(count=400, seed=0, size=SIZE):
 
 
 def test_functions_agree_with_the_documentation():
-    """Written out one by one from docs/files.md."""
+    """The basis functions are written out one by one from docs/files.md."""
     functions = Functions(SIZE, 2, 3)
     uv = pixels(20)
     w, h = SIZE
@@ -141,7 +141,7 @@ def test_functions_agree_with_the_documentation():
 
 
 def test_rings_are_orthogonal_radial_polynomials():
-    """R(r) / r (x, y) of Zernike's polynomials, over the disc around the image."""
+    """Compare with R(r) / r (x, y) of Zernike polynomials, over the disc around the image."""
     size = (640, 480)
     functions = Functions(size, 3, 0, 2)
     radius = np.hypot(*size) / 2
@@ -176,7 +176,7 @@ def test_rings_are_written_as_polynomials():
 
 @pytest.mark.parametrize('amplitude', [0.0, 5.0])
 def test_rings_exist_where_the_distortion_has_them(amplitude):
-    """A radial term of degree 5 besides a random field, seen in the middle of the image only."""
+    """A radial term of degree 5 plus a random field, seen in the middle of the image only."""
     side = 1024
     functions = Functions((side, side), 3, 12, 2)
     uv = pixels(1500, 6, (side, side))
@@ -195,12 +195,12 @@ def test_rings_exist_where_the_distortion_has_them(amplitude):
     for _ in range(4):
         prior = most_likely_prior(functions, information, right, gauge, prior)
     assert has_rings(functions, prior) == (amplitude > 0)
-    # The spiral and what is like affinity and shear do not exist.
+    # The spiral and the terms that resemble affinity and shear do not exist.
     assert (prior.trend[[15, 16, 17]] < 1e-6).all()
 
 
 def test_bands_of_sines_can_be_left_out():
-    """What remains are the sines of the other bands, and the series with zeros is the same."""
+    """The sines of the other bands remain; the full series with zero coefficients is the same."""
     every = Functions(SIZE, 3, 12)
     some = replace(every, absent=(5, 6, 7, 8, 9))
     assert (every.complete, some.complete) == (12, 4)
@@ -289,8 +289,8 @@ def test_model_with_a_series_has_a_calibrated_area():
 
 @pytest.mark.parametrize('sd, reach, nu', [(0.5, 180.0, 2.5), (1.2, 100.0, 2.5), (0.5, 150, 6.0)])
 def test_sines_have_the_matern_covariance_function(sd, reach, nu):
-    """Against the closed form with a Bessel function (Rasmussen and Williams 2006, Eq. 4.14), away
-    from the edge, where the sines vanish.
+    """Compare with the closed form with a Bessel function (Rasmussen and Williams 2006, Eq. 4.14),
+    away from the edge, where the sines vanish.
     """
     functions = Functions((1024, 1024), -1, 40)
     uv = pixels(40, size=(500, 500)) + 262
@@ -302,8 +302,8 @@ def test_sines_have_the_matern_covariance_function(sd, reach, nu):
 
 
 def drawn_field(functions, prior, seed, uv, noise):
-    """Coefficients drawn from a Prior, and noisy values of the field at pixels as information and
-    right-hand side.
+    """Draw coefficients from a Prior; return noisy values of the field at pixels as information
+    matrix and right-hand side.
     """
     rng = np.random.default_rng(seed)
     m = len(functions)
@@ -331,8 +331,8 @@ def drawn_field(functions, prior, seed, uv, noise):
 
 
 def test_prior_of_a_signal_is_estimated():
-    """Standard deviation and correlation length within a fifth, mean of several fields; absent
-    terms get no variance.
+    """Standard deviation and correlation length agree within a fifth in the mean of several
+    fields; absent terms get no variance.
     """
     functions = Functions((1024, 1024), 3, 18)
     uv = pixels(2500, 3, (1024, 1024))
@@ -356,7 +356,7 @@ def test_prior_of_a_signal_is_estimated():
 
 
 def test_slopes_of_the_likelihood_of_a_signal():
-    """Against finite differences of its cost."""
+    """The derivatives agree with finite differences of the cost."""
     functions = Functions((1024, 1024), 3, 12)
     uv = pixels(600, 5, (1024, 1024))
     prior = Prior(Signal(0.8, 400.0, 0.2, 60.0), np.ones(14))
@@ -376,7 +376,7 @@ def test_slopes_of_the_likelihood_of_a_signal():
 
 @pytest.mark.parametrize('smoothness', [1.5, 4.0])
 def test_prior_of_a_signal_says_what_short_waves_have(smoothness):
-    """A rough and a smooth field with the same standard deviation and correlation length."""
+    """Rough and smooth field have the same standard deviation and correlation length."""
     functions = Functions((1024, 1024), -1, 20)
     uv = pixels(2500, 3, (1024, 1024))
     there = Prior(Signal(1.0, 200.0, smoothness=smoothness), np.zeros(0))
@@ -390,8 +390,8 @@ def test_prior_of_a_signal_says_what_short_waves_have(smoothness):
 
 
 def test_a_signal_of_two_scales_is_found_from_the_observations():
-    """Ripples on a long wave: the standard deviation of the ripples within a quarter, and the
-    prior says how much a series without them leaves out.
+    """Ripples on a long wave: their standard deviation is within a quarter, and the prior states
+    the size of what a series omits.
     """
     functions = Functions((1024, 1024), -1, 22)
     uv = pixels(2500, 3, (1024, 1024))
@@ -418,8 +418,8 @@ def plane_wave(uv, wavelength):
     'wavelength, count', [(60.0, 1500), (80.0, 1500), (150.0, 1500), (80.0, 600)]
 )
 def test_residuals_show_the_band_of_ripples(wavelength, count):
-    """Also where the distance of the points is half the wavelength. Noise as large shows none, nor
-    do ripples for which the series has sines.
+    """Ripples are found even where the point spacing is half their wavelength. Noise of equal size
+    shows none, nor do ripples that the series can follow.
     """
     uv = pixels(count, 4, (1024, 1024))
     noise = np.random.default_rng(6).normal(0, 0.25, uv.shape)
@@ -437,7 +437,7 @@ def test_residuals_show_the_band_of_ripples(wavelength, count):
 
 @pytest.mark.parametrize('exposures', [3, 15])
 def test_ripples_that_differ_between_exposures_are_not_those_of_the_distortion(exposures):
-    """Corners of a board that are all displaced alike: a wave that moves with the board."""
+    """Like corners of a board that are all displaced alike, the wave moves with the board."""
     rng = np.random.default_rng(7)
     exposure = np.repeat(np.arange(exposures), 200)
     uv = pixels(len(exposure), 4, (1024, 1024))
@@ -447,7 +447,7 @@ def test_ripples_that_differ_between_exposures_are_not_those_of_the_distortion(e
 
 
 def test_variances_of_shown_ripples_are_those_of_their_sines():
-    """Mean squares of the coefficients, beside a noise that is as large."""
+    """Variances agree with the mean squares of the coefficients, in noise of equal size."""
     functions = Functions((1024, 1024), -1, 30)
     rng = np.random.default_rng(8)
     inside = (functions.band >= 20) & (functions.band <= 22)
@@ -461,7 +461,7 @@ def test_variances_of_shown_ripples_are_those_of_their_sines():
 
 
 def test_ripples_are_common_where_those_of_exposures_agree():
-    """Strong in the sum over all exposures, too: the same points dealt out at random show them."""
+    """Ripples that shift with the exposure count only if points are reassigned at random."""
     rng = np.random.default_rng(7)
     exposure = np.repeat(np.arange(8), 600)
     uv = pixels(len(exposure), 4, (1024, 1024))
@@ -473,7 +473,7 @@ def test_ripples_are_common_where_those_of_exposures_agree():
 
 
 def test_ripples_that_short_sines_have_followed_stand_out_of_their_bands():
-    """A wave of 150 px and a field that grows weaker with its frequency, both with noise."""
+    """A wave of 150 px does, a field whose power falls with frequency does not; both noisy."""
     uv = pixels(2000, 4, (1024, 1024))
     exposure = np.arange(2000) % 15
     noise = np.random.default_rng(6).normal(0, 0.25, uv.shape)
@@ -489,8 +489,8 @@ def test_ripples_that_short_sines_have_followed_stand_out_of_their_bands():
 
 
 def test_prior_of_ripples_is_estimated():
-    """A long field and a band of short waves: a covariance function that falls with the frequency
-    has no such gap. The variances of the band within a fifth in the mean.
+    """A long field and a band of short waves: a covariance function that falls with frequency
+    cannot have such a gap. The mean variance of the band is within a fifth.
     """
     functions = Functions((1024, 1024), -1, 22, absent=tuple(range(11, 20)))
     width = functions.frequency_of_mode
@@ -522,7 +522,7 @@ def test_expert_terms_and_gauge_are_independent():
 
 
 def network_with_additional(kind, seed=0, **shape):
-    """A small network of two fluoroscopes with additional parameters in both, and its true
+    """A small network of two fluoroscopes, both with additional parameters, and its true
     parameters. kind: 'separate' for u and v, 'shared' by them, or 'grouped' by exposures, too.
     """
     network, truth = rigs.small_network(fluoroscopes=2, seed=seed, **shape)
@@ -595,7 +595,7 @@ def dense_normal(network, result):
 @pytest.mark.parametrize('kind', ['separate', 'shared', 'grouped'])
 @pytest.mark.parametrize('shape', [dict(exposures=3, targets=30), dict(exposures=7, targets=20)])
 def test_covariances_with_additional_parameters_equal_the_dense_inverse(kind, shape):
-    """Of all unknowns and of the projection, and the information of the additional parameters."""
+    """Covariances of all unknowns and the projection, information of the additional ones."""
     network, truth = network_with_additional(kind, **shape)
     result = adjust(
         network,
@@ -710,7 +710,7 @@ def test_gradient_is_zero_at_the_solution_with_additional_parameters():
 
 
 def rig_with(field, seed=1):
-    """The virtual rig with another distortion in fluoroscope a."""
+    """The virtual rig with a given distortion in fluoroscope a."""
     rig = virtual_rig(seed)
     first = replace(rig.fluoroscopes[0], distortion=field(rig.fluoroscopes[0].distortion))
     return replace(rig, fluoroscopes=(first, *rig.fluoroscopes[1:]))
@@ -734,8 +734,8 @@ def whole(rig, model, count=10, seed=1):
 
 @pytest.mark.long
 def test_stepwise_selects_the_true_terms():
-    """Pincushion and spiral alone give radial and spiral terms and hardly any other; no distortion
-    gives none.
+    """Pincushion and spiral alone yield radial and spiral terms and hardly any others; no
+    distortion yields none.
     """
 
     def smooth(field):
@@ -760,8 +760,8 @@ class Woven(DistortionField):
 
 @pytest.mark.long
 def test_ripples_of_one_wavelength_are_corrected():
-    """They are shorter than the shortest sine that a smooth field gets. Without them, 0.25 px
-    would be left.
+    """The ripples are shorter than the shortest sine of a smooth field; uncorrected, 0.25 px would
+    remain.
     """
     field = None
 
@@ -778,7 +778,7 @@ def test_ripples_of_one_wavelength_are_corrected():
     error = error.ravel() - basis @ np.linalg.lstsq(basis, error.ravel(), rcond=None)[0]
     assert np.sqrt(np.mean(error**2)) < 0.11
     assert np.sqrt(np.mean(model.evaluate(uv).sd ** 2)) < 0.13
-    # Calibrations of parts continue with these sines, not with all that are as long.
+    # Calibrations of parts continue with exactly these sines, not with all of similar wavelength.
     problem = AdjustmentProblem(
         run.measured.network, run.measured.image_size, run.before, (GaugeKind.FULL,)
     )
@@ -789,7 +789,7 @@ def test_ripples_of_one_wavelength_are_corrected():
 
 @pytest.mark.parametrize('feedback', [-1.5, -0.6, -0.1, 0.3])
 def test_gauge_settles_where_its_steps_move_the_principal_point(feedback):
-    """With half of the image blind, a step of the gauge moves the estimate back and farther."""
+    """With half of the image blind, a gauge step moves the estimate back and overshoots."""
     network, truth = rigs.small_network()
     problem = AdjustmentProblem(network, [(1024, 1024)], adjust(network, truth), (GaugeKind.FULL,))
     part = FluoroscopeTerms.first(problem, 0, START_MODES)
@@ -817,8 +817,8 @@ def test_reported_changes_of_the_correction_vanish_as_its_terms_settle():
 
 @pytest.mark.long
 def test_auto_selects_collocation_unless_cross_validation_is_worse():
-    """Steps of the distortion in small squares are no smooth signal: a neighbour model predicts
-    them better.
+    """A distortion with steps in small squares is no smooth signal: a neighbour model predicts it
+    better.
     """
     run, state = whole(virtual_rig(1), 'collocation', 15)
     assert better_model(run, state) is None
@@ -836,12 +836,12 @@ def test_auto_selects_collocation_unless_cross_validation_is_worse():
 
 @functools.cache
 def unused():
-    """Exposures with which nothing is calibrated."""
+    """Exposures that no calibration uses."""
     return simulate_exposures(rigs.rig(), 40, 10**6, start=StreamStart(number=1001))
 
 
 def point_error(frames, job):
-    """3-D error [mm] of the object points of exposures of a with a calibration."""
+    """3-D error [mm] of the object points of exposures of a, adjusted with a calibration."""
     rig = rigs.rig()
     found = adjust_with_calibrations({'a': frames}, rig.phantom, job.calibrations).targets
     off = found.xyz_mm - rig.true_mm[found.target_id - 1]
@@ -850,7 +850,7 @@ def point_error(frames, job):
 
 @functools.cache
 def error_with_known_distortion():
-    """The error of the unused exposures where their distortion is known."""
+    """3-D error [mm] of the unused exposures when their distortion is known."""
 
     def undistorted(seen):
         return [replace(f, uv=uv) for f, uv in zip(seen.frames['a'], seen.undistorted['a'])]
@@ -865,17 +865,17 @@ def error_with_known_distortion():
     'options, most', [({}, 1.1), ({'model': 'hybrid'}, 1.15), ({'model': 'parametric'}, 1.8)]
 )
 def test_out_of_sample_error_is_near_that_of_known_distortion(options, most):
-    """40 unused exposures: 3-D error of the object points relative to known distortion."""
+    """40 unused exposures: 3-D error of the object points, relative to known distortion."""
     found = point_error(unused().frames['a'], rigs.calibrated('a', **options))
     assert found < most * error_with_known_distortion()
 
 
-# ---- smaller versions of the long runs
+# ---- shorter versions of long benchmark runs
 
 
 @pytest.mark.long
 def test_errors_agree_with_standard_deviations():
-    """Some calibrations of `make precision`: object points 0.9 to 1.1, intervals of the correction
+    """A few calibrations of `make precision`: object points 0.9 to 1.1, coverage of the correction
     near 95 %.
     """
     from benchmarks.precision import normalised
@@ -893,7 +893,7 @@ def test_errors_agree_with_standard_deviations():
 @pytest.mark.long
 @pytest.mark.parametrize('seed', [5001, 5008])
 def test_random_rigs_converge_to_the_right_answer(seed):
-    """Some cases of `make convergence`."""
+    """A few cases of `make convergence`."""
     from benchmarks.convergence import outcome
 
     result = outcome(seed)
@@ -921,9 +921,9 @@ def test_claims_hold_for_unseen_exposures_where_the_distortion_varies():
     assert 0.6 < square / np.sum(table.redundancy[good]) < 1.6
 
 
-@pytest.mark.parametrize('exposures', [4, 14])  # points or exposures are eliminated
+@pytest.mark.parametrize('exposures', [4, 14])  # eliminates the points, or the exposures
 def test_coefficients_at_the_solution_of_an_adjustment_that_stopped_before(exposures):
-    """A coefficient that its prior nearly holds says what pulls it only at the solution."""
+    """If its prior nearly fixes a coefficient, the pull on it is visible only at the solution."""
     network, truth = rigs.small_network(exposures, 25, noise_px=0.3, nu=4.0, free=False)
     functions = Functions((1024, 1024), 3)(network.uv)
     count = 2 * functions.shape[1]

@@ -41,14 +41,14 @@ SIZE = (640, 480)
 
 
 def training(n=600, seed=0, noise=0.2):
-    """Training pixels on an image of SIZE and corrections with noise."""
+    """Training pixels on an image of SIZE, and corrections with noise."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (n, 2))
     return uv, 5 * np.sin(uv / 90) + rng.normal(0, noise, uv.shape)
 
 
 def pixels(n=2000, seed=1):
-    """Pixels of the image: random, the corners, the edge, and borders of cells of every size."""
+    """Pixels of the image: random, the corners, the edge, and cell borders of every cell size."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (n, 2))
     uv[: n // 4] = np.clip(np.round(uv[: n // 4] / 8) * 8 - 0.5, -0.5, np.array(SIZE) - 0.5)
@@ -103,8 +103,8 @@ def test_local_linear_equals_a_weighted_least_squares_plane_for_each_pixel(k):
         expected[row] += at_query @ left[near]
         norms2[row] = np.sum(at_query**2)
     model = create_model('local_linear', k, uv, duv, noise_px=2.0)
-    # The ridge that keeps collinear neighbours harmless is a millionth of the weights.
-    wide = k > 6  # five points determine a plane, and sometimes badly
+    # The ridge that makes collinear neighbours harmless is a millionth of the weights.
+    wide = k > 6  # five points determine a plane, sometimes badly
     error = np.abs(model.predict(query) - expected).max(axis=1)
     assert (np.max(error) if wide else np.quantile(error, 0.9)) < 1e-3
     if wide:
@@ -113,7 +113,7 @@ def test_local_linear_equals_a_weighted_least_squares_plane_for_each_pixel(k):
 
 @pytest.mark.parametrize('k', [6, 30, 200])
 def test_local_planes_reproduce_planes_beyond_the_edge(k):
-    """Without the trend: the weights sum to one and have no first moment about the pixel."""
+    """Without the trend, the weights sum to one and have zero first moment about the pixel."""
     uv, _ = training()
     query = np.concatenate([pixels(100), [[-40.0, -40.0], [700.0, 500.0]]])
     order = np.argsort(np.linalg.norm(uv[None] - query[:, None], axis=2), axis=1)[:, :k]
@@ -127,7 +127,7 @@ def test_local_planes_reproduce_planes_beyond_the_edge(k):
 
 
 def test_local_linear_reproduces_cubic_polynomials():
-    """The trend is exact for them, wherever the pixel lies."""
+    """The trend reproduces cubic polynomials exactly, wherever the pixel lies."""
     uv, _ = training(noise=0)
     rng = np.random.default_rng(3)
     coefficients = rng.normal(size=(10, 2))
@@ -145,7 +145,7 @@ def test_local_linear_reproduces_cubic_polynomials():
 
 
 def test_knn_has_no_trend_and_local_linear_a_cubic_one():
-    """A mean of neighbours is the paper's model, without a trend."""
+    """The mean of neighbours is the model of the paper, which has no trend."""
     assert KnnModel.trend_degree is None and len(Trend(None, training()[0])) == 0
     assert len(Trend(LocalLinearModel.trend_degree, training()[0])) == 10
     assert least_squares_map(np.zeros((5, 0))).shape == (0, 5)
@@ -213,7 +213,7 @@ def test_outside_is_beyond_the_convex_hull():
 
 
 def test_training_points_on_a_line_enclose_nothing():
-    """Everything is outside, and predictions stay finite."""
+    """Every pixel is outside, and predictions stay finite."""
     line = np.column_stack([np.linspace(0, 600, 80), np.linspace(0, 400, 80)])
     model = create_model('local_linear', 12, line, np.sin(line / 50))
     found = model.evaluate(pixels(100))
@@ -222,8 +222,8 @@ def test_training_points_on_a_line_enclose_nothing():
 
 @pytest.mark.parametrize('kind, k', [('knn', 9), ('local_linear', 40)])
 def test_standard_deviations_against_monte_carlo(kind, k):
-    """600 times new noise in the training values: predictions scatter by their standard deviation;
-    bias_px is added to it.
+    """600 draws of noise in the training values: predictions scatter by their standard deviation,
+    to which bias_px is added.
     """
     uv, duv = training(noise=0)
     query = np.random.default_rng(5).uniform([60, 60], [580, 420], (40, 2))
@@ -247,7 +247,7 @@ def test_standard_deviations_against_monte_carlo(kind, k):
 
 @pytest.mark.parametrize('weighted', [False, True])
 def test_scores_of_knn_equal_a_loop_with_scikit_learn(weighted):
-    """G for every k with folds of whole exposures, errors weighted by C_r^-1."""
+    """G for every k with whole exposures as folds, errors weighted by C_r^-1."""
     uv, duv = training(300)
     rng = np.random.default_rng(9)
     information = random_information(rng, 300) if weighted else np.tile(np.eye(2), (300, 1, 1))
@@ -267,7 +267,7 @@ def test_scores_of_knn_equal_a_loop_with_scikit_learn(weighted):
 
 
 def test_k_of_knn_is_that_of_grid_search():
-    """Same folds, no weights: k and scores of scikit-learn's GridSearchCV."""
+    """With the same folds and no weights, k and scores equal those of GridSearchCV."""
     uv, duv = training(300, noise=1.0)
     groups = np.random.default_rng(10).integers(0, 12, 300)
     fold = np.empty(300, dtype=int)
@@ -294,7 +294,7 @@ def test_k_of_knn_is_that_of_grid_search():
 
 
 def test_scores_of_local_linear_equal_a_loop_with_models():
-    """The trend is that of the other folds, too: nothing of a held-out exposure is used."""
+    """The trend is fitted to the other folds, too: nothing of a held-out exposure is used."""
     uv, duv = training(300)
     rng = np.random.default_rng(11)
     information = random_information(rng, 300)
@@ -335,7 +335,7 @@ def test_candidates_are_limited_by_the_training_points():
     steps = LocalLinearModel.candidate_k(2000)
     assert steps[0] == 10 and 300 < steps[-1] <= 400 and (np.diff(steps) > 0).all()
     assert LocalLinearModel.candidate_k(20).tolist() == [8]
-    # A fold may leave fewer points than a candidate asks for: that one is not tried.
+    # A fold may have fewer points than a candidate k needs: that candidate is skipped.
     uv, _ = training(30)
     assert CrossValidation(KnnModel, uv, np.arange(30) % 2, [5, 15, 16]).candidates.tolist() == [
         5,
@@ -349,7 +349,7 @@ def test_candidates_are_limited_by_the_training_points():
 
 
 def test_interior_in_the_gauge_about_another_principal_point():
-    """A turned sensor with a far principal point is the same camera with another correction."""
+    """A rotated sensor with a far principal point is the same camera with another correction."""
     axis = np.linspace(0, 1023, 12)
     uv = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     near = np.array([500.0, 530.0, 3800.0])
@@ -364,7 +364,7 @@ def test_interior_in_the_gauge_about_another_principal_point():
 
 
 def test_gauge_is_the_effect_of_a_change_of_orientation():
-    """Changes of xp, yp, c and rotations of the sensor common to all exposures, to first order."""
+    """To first order, of changes of xp, yp, c and sensor rotations common to all exposures."""
     network, truth = rigs.small_network(exposures=5, targets=40)
     rotation, position, points, interior = network.per_image_point(truth)
     uv = project(rotation, position, points, interior)
@@ -382,7 +382,7 @@ def test_gauge_is_the_effect_of_a_change_of_orientation():
         coefficients = gauge_coefficients(uv, change, truth.interior[0])
         left = change - basis @ coefficients
         assert np.max(np.abs(left)) < 1e-5 * np.max(np.abs(change)), number
-    # And each change has its own part of it, as the docstring says.
+    # Each change has its own component of the gauge, as the docstring of gauge_basis states.
     wanted = [
         np.column_stack([np.ones_like(x), 0 * x]),
         np.column_stack([0 * x, np.ones_like(x)]),
@@ -394,7 +394,7 @@ def test_gauge_is_the_effect_of_a_change_of_orientation():
     shifts = {
         3: 1,
         4: 0,
-    }  # a turn about the rows moves the image down, one about the columns to the right
+    }  # a rotation about the rows shifts the image down, one about the columns to the right
     for number, (change, want) in enumerate(zip(changes, wanted)):
         a = np.column_stack(
             [want.ravel()] + ([wanted[shifts[number]].ravel()] if number in shifts else [])
@@ -429,7 +429,7 @@ def chosen(kind='local_linear', gauge=GaugeKind.FULL, k=None):
 
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
 def test_regression_smooths_as_its_model_predicts(kind):
-    """Fitted to the inliers only, evaluated at all image points; outliers have no influence."""
+    """The fit uses inliers only and is evaluated at all image points; outliers have no effect."""
     regressor, values = chosen(kind)
     inside = regressor.inliers
     np.testing.assert_array_equal(inside, np.arange(600) % 30 != 0)
@@ -480,7 +480,7 @@ def test_changes_are_reported_and_inliers_have_hysteresis():
     q = np.where(np.arange(600) % 30 == 0, 2 * INLIER_Q, 1.0)
     regressor.choose(values, q, information)
     assert not regressor.changed
-    # in doubt, and well inside
+    # near the limit, and well inside
     q[0] = 0.8 * INLIER_Q
     q[30] = 0.4 * INLIER_Q
     values[[0, 30]] -= 500
@@ -495,8 +495,8 @@ def test_changes_are_reported_and_inliers_have_hysteresis():
 @pytest.mark.parametrize('gauge', [GaugeKind.FULL, GaugeKind.TURNS])
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
 def test_fitted_correction_is_made_orthogonal_to_the_gauge(kind, gauge):
-    """To shift, scale and rotations of the sensor; only to the rotations while the interior
-    orientation is held.
+    """To shift, scale and sensor rotations; only to the rotations while the interior orientation
+    is fixed.
     """
     interior = np.array([320.0, 240.0, 2000.0])
     regressor, values = chosen(kind, gauge)
@@ -528,7 +528,7 @@ def test_scale_is_part_of_the_correction_while_the_interior_orientation_is_held(
 
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
 def test_noise_and_bias_of_a_model_are_estimated(kind):
-    """Noise of 0.3 px on a plane field: hardly any bias. A short wave: a clear bias."""
+    """Noise of 0.3 px on a plane field gives hardly any bias, a short wave a clear one."""
     rng = np.random.default_rng(13)
     uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (1500, 2))
     exposure = np.repeat(np.arange(15), 100)
@@ -554,7 +554,7 @@ def test_copy_with_other_noise_keeps_the_predictions():
 
 
 def test_neighbour_table_equals_a_search_among_the_allowed_points():
-    """In order of distance, also where few points are allowed, and after a restriction."""
+    """Sorted by distance, also where few points are allowed and after a restriction."""
     uv, _ = training(400)
     rng = np.random.default_rng(14)
     table = NeighbourTable(uv, 12)

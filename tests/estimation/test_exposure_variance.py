@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How far the distortion of a later exposure differs: what object points can absorb is not it."""
+"""Variance of the distortion between exposures, excluding what object points can absorb."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ EXPOSURES = 10
 
 @pytest.fixture(scope='module')
 def case():
-    """Network, its adjustment and derivatives, and terms of the exposures."""
+    """A network, its adjustment and derivatives, and terms of its exposures."""
     network, true = rigs.small_network(EXPOSURES, 80, survey_sd_mm=0.2, free=False, seed=3)
     found = adjust(network, true, np.zeros_like(network.uv), Noise('gaussian', 0.3))
     _, by_exterior, by_point, _ = project_with_jacobian(*network.per_image_point(found.parameters))
@@ -61,7 +61,7 @@ def case():
 
 
 def mean_square_left(network, by_exterior, values):
-    """Mean square of values (N, 2) without what the orientation of each exposure absorbs."""
+    """Mean square of values (N, 2) after removing what exposure orientations absorb."""
     square = 0.0
     for number in range(network.n_exposures):
         at = network.exposure == number
@@ -84,7 +84,7 @@ def test_terms_that_differ_at_random_have_their_own_size(case):
         ratios.append(got / true)
     assert np.mean(ratios) == pytest.approx(1, abs=0.05)
     assert np.std(ratios) < 0.1
-    # Coefficients that are only known to be within their prior are as large as it says.
+    # Coefficients of which only the prior is known are as large as the prior states.
     prior = np.diag(np.tile(terms.variance, terms.exposures))
     got = variance_between_exposures(network, found, 0, terms, np.zeros(terms.count), prior).mean()
     draws = [rng.normal(0, np.sqrt(np.diagonal(prior))) for _ in range(20)]
@@ -101,16 +101,16 @@ def test_a_phantom_that_has_shrunk_is_no_variation(case):
     coefficients = np.linalg.lstsq(values, shift.ravel(), rcond=None)[0]
     like_variation = terms.values @ coefficients
     scale = np.sqrt(np.mean(like_variation**2))
-    assert scale > 0.1  # the terms can follow it
+    assert scale > 0.1  # the terms can imitate the shrinkage
     exact = np.zeros((terms.count, terms.count))
     got = variance_between_exposures(loose, found, 0, terms, coefficients, exact).mean()
     assert got < 0.3 * mean_square_left(network, by_exterior, like_variation)
 
 
 def estimated_size(network, true):
-    """Size of the terms of exposures [px] after some renewals, and by estimates under the survey.
+    """Size of exposure terms [px] after some updates, with free points and under the survey.
 
-    The errors of the survey are taken to be independent there.
+    The second estimate takes the survey errors to be independent.
     """
     sizes = []
     for beside_free_points in (True, False):
@@ -188,9 +188,9 @@ ANGLES = np.deg2rad(np.linspace(-80.0, 85.0, 12))
 
 
 def estimated_terms(sd, random_px, seed=6, series_px=0.0):
-    """Estimates of a series and of terms of exposures that follow the angle, and their changes.
+    """Estimates of a series and of exposure terms that follow the angle, with their changes.
 
-    sd: of the estimates [px]; random_px: of what differs at random.
+    sd: standard deviation of the estimates [px]; random_px: random change of an exposure [px].
     """
     rng = np.random.default_rng(seed)
     exposures = len(ANGLES)
@@ -208,7 +208,7 @@ def estimated_terms(sd, random_px, seed=6, series_px=0.0):
     root = rng.normal(0, 1.0, (p, p))
     covariance = sd**2 * (np.eye(p) + 0.5 * root @ root.T / p)
     drawn = np.concatenate([np.full(c, series_px), change.ravel()])
-    # A posterior, which the prior of the terms has made smaller.
+    # Posterior: the prior of the terms has shrunk the estimates.
     information = np.linalg.inv(covariance)
     prior = np.diag(np.r_[np.zeros(c), terms.precision])
     posterior = np.linalg.inv(information + prior)
@@ -232,7 +232,7 @@ def test_terms_that_follow_the_angle_are_a_field_of_it():
 
 
 def test_effects_of_the_angle_are_a_posterior_of_all_estimates():
-    """Dense: harmonics and random differences with the variances that were found, series free."""
+    """Dense solution: harmonics and random differences with the found variances, series free."""
     estimated, _, h, _ = estimated_terms(0.05, 0.05, series_px=2.0)
     terms = estimated.terms
     fit = fit_angles(estimated, ANGLES)
@@ -245,7 +245,7 @@ def test_effects_of_the_angle_are_a_posterior_of_all_estimates():
     mean, covariance = effects.estimate(plain, own @ estimated.coefficients[c:])
     np.testing.assert_allclose(fit.effects.mean, mean[: effects.count], rtol=1e-9)
     variance = effects._variance
-    # All coefficients together: those of the series, then the effects.
+    # Joint estimate of all coefficients: first those of the series, then the effects.
     design = np.block(
         [
             [np.eye(c), np.zeros((c, effects.design.shape[1]))],
@@ -300,7 +300,7 @@ def test_variances_of_effects_are_the_most_likely_ones():
 
 
 def test_a_field_has_the_covariances_of_its_effects():
-    """Against those of drawn fields, over the grid, mean of u and v."""
+    """Compare with drawn fields, over the grid, as the mean of u and v."""
     rng = np.random.default_rng(9)
     estimated, *_ = estimated_terms(0.05, 0.05)
     series, terms = estimated.functions, estimated.terms
@@ -358,7 +358,7 @@ def test_exposures_of_enough_image_points_determine_terms():
 
 
 def test_small_exposures_do_not_count_in_a_variation():
-    """Square sums over their expectation, written out."""
+    """Expected values are written out as square sums over their expectation."""
     rng = np.random.default_rng(10)
     exposure = np.repeat([0, 1, 2], [60, 29, 50])
     uv = rng.uniform(0, 1024, (139, 2))
@@ -398,7 +398,7 @@ def test_changes_of_the_interior_are_what_turns_do_not_absorb():
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t'])
 def test_estimates_beside_free_points_are_those_with_a_loose_survey(loss):
-    """Solved anew with ten times the standard deviations of the survey."""
+    """Reference: a new solution with ten times the standard deviations of the survey."""
     network, true = rigs.small_network(4, 40, survey_sd_mm=0.2, seed=3)
     functions = exposure_functions(network.uv, SIZE, true.interior[0])
     terms = ExposureTerms(functions, network.exposure, SIZE_PX)

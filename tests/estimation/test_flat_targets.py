@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Flat targets: grids and boards from tilted views, on the intensifier, and with a phantom."""
+"""Flat targets: grids and boards in tilted views, on the image intensifier, and with a phantom."""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ def ideal(pose, interior):
 
 
 def test_homographies_give_pose_and_principal_distance():
-    """Exact image points with 40 % false matches; the mirrored pose is its own inverse."""
+    """Exact image points with 40 % false matches. The mirrored pose is its own inverse."""
     interior = np.array([500.0, 520.0, 3900.0])
     plane = plane_of(POINTS)
     found = []
@@ -92,7 +92,7 @@ def test_homographies_give_pose_and_principal_distance():
 
 
 def test_the_adjustment_of_a_board_is_that_of_opencv():
-    """Least squares without distortion, the board exact: the same interior orientation."""
+    """Least squares without distortion, exact board: the interior orientations are the same."""
     interior = np.array([500.0, 520.0, 3900.0])
     rng = np.random.default_rng(5)
     tilts = [15, 30, 35, 25, 40, 20]
@@ -133,7 +133,7 @@ def test_a_tilted_grid_calibrates_nearly_as_well_as_known_distortion_allows():
 
 
 def test_a_grid_parallel_to_the_image_needs_the_principal_distance():
-    """Without it, one finding; with it a single exposure gives the distortion."""
+    """Without it there is one finding; with it, a single exposure yields the distortion."""
     frames = exposures([0.0, 0.0, 0.0, 0.0], shift_mm=20.0)
     with refused(Kind.UNTILTED_TARGETS) as error:
         run_calibration(CalibrationRequest({'a': frames}, SURVEY))
@@ -145,7 +145,7 @@ def test_a_grid_parallel_to_the_image_needs_the_principal_distance():
     assert calibration.interior[2] == c
     inside = frames[1].uv[~calibration.model.outside(frames[1].uv)]
     error = calibration.model.predict(inside) - fluoroscope().distortion(inside)
-    # A homography takes up what the exposures cannot show: shift, scale, turn, tilt.
+    # A homography absorbs what the exposures cannot show: shift, scale, rotation and tilt.
     corrected = inside + error
     h = robust_homography(inside, corrected)
     mapped = np.column_stack([inside, np.ones(len(inside))]) @ h.T

@@ -33,7 +33,7 @@ SIZE = (120, 93)
 
 
 def calibration_of(kind):
-    """A calibration of the virtual rig with its grid."""
+    """A calibration of the virtual rig with its lookup grid."""
     return rigs.calibrated('a', model=kind).calibrations['a']
 
 
@@ -44,9 +44,7 @@ def looked_up(grid, uv):
 
 
 def any_pixels(grid, n=6000, seed=0):
-    """Random pixels, and the corners, edge midpoints, centres and borders of cells, where errors
-    are largest.
-    """
+    """Random pixels, and corners, edge midpoints, centres and borders of cells: largest errors."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(-0.5, np.array(grid.image_size) - 0.5, (n, 2))
     for part, halves in ((slice(0, n // 4), 1), (slice(n // 4, n // 2), 2)):
@@ -58,12 +56,12 @@ def any_pixels(grid, n=6000, seed=0):
 
 
 def difference(grid, model, uv):
-    """Largest difference (n,) of a coordinate of the correction from the exact model."""
+    """Largest coordinate difference (n,) between the lookup and the exact model."""
     return np.abs(looked_up(grid, uv)[0] - model.predict(uv)).max(axis=1)
 
 
 def corners_of(grid, uv):
-    """The four corners (4, n, 2) of the cells of pixels; a pixel on a border belongs to either
+    """The four corners (4, n, 2) of the cells of pixels. A pixel on a border belongs to either
     cell.
     """
     place = []
@@ -84,14 +82,14 @@ def training(n=300, seed=0, noise=0.1, size=SIZE):
 
 @pytest.mark.parametrize('kind', SMOOTH)
 def test_lookup_agrees_with_the_model_within_a_hundredth_of_a_pixel(kind):
-    """At random pixels, where cells are least accurate, and near the worst pixels found."""
+    """Checked at random pixels, where cells are least accurate, and near the worst pixels."""
     calibration = calibration_of(kind)
     grid = calibration.grid
     model = calibration.model
     uv = any_pixels(grid)
     found = difference(grid, model, uv)
     rng = np.random.default_rng(1)
-    for _ in range(3):  # climb
+    for _ in range(3):  # search uphill for the largest error
         worst = uv[np.argsort(found)[-40:]]
         near = (worst[:, None] + rng.uniform(-1, 1, (40, 40, 2)) * grid.cell_px).reshape(-1, 2)
         uv = np.concatenate([worst, near[points_on_image(near, grid.image_size)]])
@@ -99,8 +97,8 @@ def test_lookup_agrees_with_the_model_within_a_hundredth_of_a_pixel(kind):
     assert found.max() <= LIMIT_PX
     stated = max(grid.error_px, grid.error_outside_px)
     assert stated <= LIMIT_PX and grid.error_px <= LIMIT_PX
-    # What is stated is measured at middles: what bends has its largest error there, a kink may
-    # have it beside.
+    # The stated error is measured at midpoints. A smooth function has its largest error there; the
+    # maximum at a kink may lie next to them.
     assert found.max() <= 1.5 * stated + 1e-9 and found.max() >= 0.5 * stated
 
 
@@ -116,7 +114,7 @@ def test_lookup_is_exact_at_the_corners_of_cells(kind):
 
 
 def test_lookup_of_nearest_neighbours_lies_between_the_corners_of_the_cell():
-    """The model knn is piecewise constant, and its cells are small."""
+    """The knn model is piecewise constant, and its cells are small."""
     calibration = calibration_of('knn')
     grid = calibration.grid
     assert grid.cell_px == min(grid_cells.CELL_PX)
@@ -165,17 +163,17 @@ def test_corners_have_the_neighbours_of_the_model_for_any_training_points(kind, 
     exact = model.evaluate(corner)
     found, sd, _ = looked_up(grid, corner)
     assert np.isfinite(found).all() and np.isfinite(sd).all()
-    # Planes of neighbours that all lie far to one side are ill determined: so are the last digits.
+    # Planes of neighbours far to one side are ill-conditioned, and so are their last digits.
     certain = exact.sd < 1
     assert certain.mean() > 0.9 or points in ('clusters', 'beside', 'duplicates') or k == 6
     np.testing.assert_allclose(found[certain], exact.duv[certain], rtol=0, atol=1e-6)
-    # Of equally distant neighbours the model takes any k, and the grid all.
+    # The model takes any k of equally distant neighbours, the grid takes all.
     if points != 'duplicates':
         np.testing.assert_allclose(sd[certain], exact.sd[certain], rtol=1e-6, atol=1e-8)
 
 
 def test_insufficient_accuracy_is_reported():
-    """Rough values, few neighbours: no cell is small enough."""
+    """Rough values and few neighbours: no cell size is small enough."""
     uv, duv = training(noise=3.0)
     model = create_model('local_linear', 6, uv, duv)
     grid = CorrectionGrid(model, SIZE)
@@ -187,7 +185,7 @@ def test_insufficient_accuracy_is_reported():
 
 @pytest.mark.parametrize('k, noise, height', [(12, 0.1, 0.1), (30, 0.3, 0.3)])
 def test_cells_that_are_not_accurate_enough_are_divided(k, noise, height):
-    """Few neighbours give kinks; pixels in divided cells, on their edges, and on the edges of
+    """Few neighbours cause kinks. Pixels lie in divided cells, on their edges and on edges of
     their parts.
     """
     uv, duv = training(1500, noise=noise, size=(500, 400))
@@ -240,7 +238,7 @@ def test_large_image_has_larger_cells(monkeypatch):
 
 
 def hostile_points(kind, count):
-    """Training points (count, 2) that nobody has, in an image of 1024 x 1024 px."""
+    """Unrealistic training points (count, 2) in an image of 1024 x 1024 px."""
     rng = np.random.default_rng(7)
     if kind == 'heap':
         return 500 + rng.uniform(0, 2, (count, 2))
@@ -253,7 +251,7 @@ def hostile_points(kind, count):
     'kind, model, k', [('heap', 'local_linear', 50), ('two heaps', 'knn', 1000), ('all', 'knn', 5)]
 )
 def test_work_on_hostile_training_points_is_bounded(monkeypatch, kind, model, k):
-    """200,000 of them took minutes. The cells are larger instead, and the errors are known."""
+    """200,000 such points took minutes; now cells are larger instead, and errors are known."""
     uv = hostile_points(kind, 200_000)
     found = create_model(model, k, uv, np.sin(uv / 100), 0.1, 0.0)
     done = []
@@ -276,7 +274,7 @@ def test_work_on_hostile_training_points_is_bounded(monkeypatch, kind, model, k)
 
 @pytest.mark.parametrize('size', [(1, 1), (3, 2), (17, 33), (130, 7), (121, 94)])
 def test_images_of_any_size(size):
-    """Cells reach from edge to edge, whatever the image size."""
+    """Cells extend from edge to edge, whatever the image size."""
     model = create_model('local_linear', 40, *training())
     grid = CorrectionGrid(model, size)
     uv = any_pixels(grid, 800)
@@ -320,7 +318,7 @@ def test_outside_against_a_triangulation():
     )
     border = np.zeros(len(query), dtype=bool)
     for line, x in zip(grid.nodes, query.T):
-        border |= np.abs(x[:, None] - line).min(axis=1) < 1e-6  # in either of two cells
+        border |= np.abs(x[:, None] - line).min(axis=1) < 1e-6  # may belong to either of two cells
     assert 0.1 < inside.mean() < 0.9 and 0.1 < border.mean() < 0.9
     np.testing.assert_array_equal((looked_up(grid, query)[2] == OK)[~border], inside[~border])
 
@@ -379,7 +377,7 @@ def test_points_at_the_edge_and_off_the_image(kind):
     np.testing.assert_allclose(found.uv, exact.uv, rtol=0, atol=LIMIT_PX)
 
 
-# ---- the same numbers from every way in
+# ---- the same numbers by every interface
 
 
 def test_frames_and_large_arrays_give_the_same_bits():
@@ -443,7 +441,7 @@ def test_results_are_written_into_given_arrays():
 
 
 def test_two_grids_of_one_calibration_are_the_same():
-    """Live and offline processes build their own."""
+    """Live and offline processes each build their own grid."""
     for kind in ('local_linear', 'collocation'):
         calibration = calibration_of(kind)
         other = replace(calibration)
@@ -459,7 +457,7 @@ def test_copy_of_a_grid_gives_the_same():
     calibration = calibration_of('parametric')
     uv = any_pixels(calibration.grid, 100)
     calibration.correct(uv[::-1])
-    other = copy.deepcopy(calibration.grid)  # by the same protocol as for another process
+    other = copy.deepcopy(calibration.grid)  # the copy protocol that is used for another process
     assert looked_up(other, uv)[0].tobytes() == looked_up(calibration.grid, uv)[0].tobytes()
 
 
@@ -484,7 +482,7 @@ def test_sigma_includes_observation_and_correction():
 
 
 def test_threads_share_a_grid():
-    """Frames of different lengths at the same time, first lookups included, give the right
+    """Frames of different lengths at the same time, including the first lookups, give correct
     numbers.
     """
     grid = CorrectionGrid(calibration_of('collocation').model, (1024, 1024))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From frames to a network: what is used, start values, and what is excluded."""
+"""From frames to a network: selection of observations, initial values, and exclusions."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -79,7 +79,7 @@ POSES = [((0, 0, 0), (0, 0, 0)), ((0.3, 0.1, 0), (5, 0, 0)), ((0, 0.4, 0.2), (0,
 
 
 def frames_of(points, name='a', poses=POSES, noise=0.0, seed=2, **more):
-    """Frames 1, 2, ... of targets from 10 on."""
+    """Frames numbered 1, 2, ... with target ids from 10 upwards."""
     rng = np.random.default_rng(seed)
     ids = 10 + np.arange(len(points))
     return [
@@ -104,7 +104,7 @@ def test_network_holds_the_image_points_by_exposure_and_target():
     kept = np.arange(30) != 4
     second = [f.rows(kept) for f in frames_of(points, 'b')]
     second = [replace(f, sigma=0.5 + 0.01 * np.arange(29), angle=0.1 * f.number) for f in second]
-    # Neither the order of frames nor that of targets matters.
+    # The order of frames and of targets does not matter.
     shuffled = np.random.default_rng(3).permutation(29)
     second[1] = replace(
         second[1],
@@ -145,7 +145,7 @@ def test_target_that_no_exposure_shows_is_no_object_point():
 
 
 def test_calibrations_that_are_fixed_need_one_exposure():
-    """Its correction is taken off the image points before the resection."""
+    """The fixed correction is subtracted from the image points before the resection."""
     points = cube()
     (frame,) = frames_of(points, poses=POSES[1:2])
     shift = np.array([8.0, -5.0])
@@ -185,7 +185,7 @@ def test_start_values_of_all_exposures_replace_resections():
     found = measured_network({'a': frames}, phantom_of(points), starts=starts)
     np.testing.assert_array_equal(found.start.interior[0], interior)
     np.testing.assert_array_equal(found.start.points_mm, points)
-    # With its correction, the orientations are those of the earlier calibration.
+    # With its correction, the orientations equal those of the earlier calibration.
     corrected = [replace(f, uv=f.uv + [2.0, -1.0]) for f in frames]
     found = measured_network(
         {'a': corrected}, phantom_of(points), starts=replace(starts, earlier=earlier)
@@ -266,7 +266,7 @@ def test_exposures_whose_residuals_are_many_times_the_median_do_not_fit(factor, 
     ],
 )
 def test_poses_differ_by_a_turn_or_a_shift(degrees, shift_mm, same):
-    """A shift along the optical axis counts a tenth; the turn about the place is none."""
+    """A shift along the optical axis counts a tenth; a turn about the phantom is no shift."""
     first = matrix_from_vector(np.array([0.3, -0.2, 0.5]))
     place = np.array([10.0, 20.0, 1500.0])
 
@@ -378,7 +378,7 @@ def test_principal_point_to_start_with_is_the_centre_of_the_image():
     np.testing.assert_array_equal(nominal_interior((1024, 768), 3000.0), [511.5, 383.5, 3000.0])
 
 
-# ---- start orientations
+# ---- initial orientations
 
 
 def view(points, uv):
@@ -443,7 +443,7 @@ def test_orientation_with_the_smallest_residuals_is_taken(monkeypatch):
 
 
 def test_principal_distance_is_the_median_of_views_in_space():
-    """Before those of few targets, and these before planes."""
+    """Such views precede those with few targets, which precede planes."""
     views = []
     for k, c in enumerate((3000.0, 5000.0, 3900.0)):
         interior = np.array([511.5, 511.5, c])
@@ -460,7 +460,7 @@ def test_principal_distance_is_the_median_of_views_in_space():
     ]
     assert principal_distance_of_views(flat, middle, SIZE) == pytest.approx(4000, rel=1e-3)
     assert principal_distance_of_views([*flat, few], middle, SIZE) == pytest.approx(9000, rel=1e-3)
-    # Half to thirty times the longer side.
+    # The possible range is half to thirty times the longer side.
     for size, possible in (
         ((7900, 10), True),
         ((8100, 10), False),
@@ -486,7 +486,7 @@ def resected(points, pose):
 
 
 def test_preliminary_correction_is_the_cubic_polynomial_of_all_residuals():
-    """False matches do not count, nor views that are not oriented."""
+    """False matches and views that are not oriented have no influence."""
     flat = flat_grid()
     poses = [((0.3, 0, 0), (0, 0, 0)), ((0, 0, 0.3), (40, 0, 0)), ((0.2, 0, 0.2), (-40, 0, 30))]
     views = []
@@ -518,7 +518,7 @@ def test_a_plane_gets_the_better_of_its_two_poses():
     with_projection = view(solid, seen(solid)[0])
     same = _better_pose(with_projection, resected(solid, POSES[0]), INTERIOR)
     assert same.scale < 1e-3
-    # Distortion bends a plane as a tilt does; with other exposures the pose is found.
+    # Distortion bends a plane as a tilt does; with more exposures the pose is found.
     poses = [
         ((0.3, 0, 0.0), (0, 0, 0)),
         ((0, 0, 0.35), (40, 0, 0)),

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """Relative orientation, datum, weights of the interior orientation and outliers, from calibration
-to command line.
+to the command line.
 """
 
 import json
@@ -59,7 +59,7 @@ def test_result_contains_the_relative_orientation(jobs):
         turn = matrix_from_quaternion(document['quaternion_wxyz']) @ rotation.T
         assert (
             np.rad2deg(np.arccos((np.trace(turn) - 1) / 2)) < 10
-        )  # as far as the gauge of the correction goes
+        )  # up to the gauge of the correction
         assert np.linalg.norm(document['translation_mm']) == pytest.approx(length, abs=2)
         assert np.all(np.array(document['sd_mm']) > 0) and np.all(np.array(document['sd_rad']) > 0)
         json.loads(json_text(result_document(jobs[way])))
@@ -105,7 +105,7 @@ def test_exposures_are_paired_by_number():
 @pytest.mark.long
 @pytest.mark.parametrize('model', ['none', 'collocation', 'local_linear'])
 def test_free_network_is_calibrated(model):
-    """Its shape is that of the phantom; undetermined targets are left out and reported."""
+    """Its shape is that of the phantom; undetermined targets are excluded and reported."""
     job = calibrate(
         FRAMES,
         PHANTOM,
@@ -245,7 +245,7 @@ def test_command_line_constrains_the_relative_orientation(files):
     [(3, 1, 1), (5, 1, 1), (6, 3, 1), (9, 3, 1), (10, 5, 5), (17, 5, 5), (18, 5, 9)],
 )
 def test_functions_of_the_angle_have_two_pairs_each(pairs, of_one, of_two):
-    """One is constant, each order of the harmonics adds two for every angle that is its own."""
+    """One function is constant; each harmonic order adds two per independent angle."""
     angles = np.linspace(-1.0, 1.2, pairs)
     unknown = np.full(pairs, np.nan)
     for other, columns in ((angles, of_one), (angles**2 - 1, of_two), (unknown, of_one)):

@@ -52,7 +52,7 @@ def outcome(motion):
 
 
 def error_inside(model):
-    """RMS error [px] of the correction itself, nothing of it taken up by an orientation."""
+    """RMS error [px] of the correction itself, without any part absorbed by an orientation."""
     pixels = np.stack(np.meshgrid(*[np.arange(20.0, 1010, 30)] * 2), axis=2).reshape(-1, 2)
     inside = pixels[~model.outside(pixels)]
     assert len(inside) > 600
@@ -74,7 +74,7 @@ def test_four_markers_an_exposure_give_the_distortion(outcome):
 @pytest.mark.parametrize('model', ['local_linear', 'parametric'])
 @pytest.mark.long
 def test_other_models_learn_shift_and_scale_too(motion, model):
-    """The principal point given is 5 px off: with the orientation held the correction has it."""
+    """The given principal point is 5 px off; with orientation fixed, the correction has it."""
     shifted = replace(motion.known['a'], interior=motion.known['a'].interior + [5.0, -3.0, 0.0])
     request = replace(motion, known={'a': shifted}).request(motion.frames, model=model)
     model = calibrate_request(request).calibrations['a'].model
@@ -95,7 +95,7 @@ def test_an_orientation_with_standard_deviations_is_improved(motion):
 
 
 def test_prior_of_an_exterior_orientation_is_weighted_as_it_should_be():
-    """An orientation observed twice: the prior's information adds to that of the images."""
+    """An orientation is observed twice: information of the prior and of the images add up."""
     network, truth = rigs.small_network(exposures=3, targets=30, nu=np.inf)
     noise = Noise('gaussian', 0.3)
     free = adjust(network, truth, None, noise)
@@ -138,7 +138,7 @@ def test_what_is_saved_is_looked_up_and_validated(outcome, motion, tmp_path):
 
 
 def one_pose():
-    """The phantom at rest in one exposure of both fluoroscopes, its frame that of the lab."""
+    """The phantom at rest in one exposure of both fluoroscopes; its frame is the lab frame."""
     rng = np.random.default_rng(4)
     frames = {}
     for one in rigs.rig().fluoroscopes:
@@ -152,7 +152,7 @@ def one_pose():
 def test_one_pose_is_enough_and_orients_the_rig_in_the_lab():
     known = {one.name: truth_of(one) for one in rigs.rig().fluoroscopes}
     request = CalibrationRequest(one_pose(), rigs.rig().phantom, PLAIN, known_orientations=known)
-    # Without a correction the residuals are too large for a calibration.
+    # Without a correction, the residuals are too large for a calibration.
     orientation = run_calibration(request, force=True).orientation
     assert orientation.frame_id == 'lab'
     for f, one in enumerate(rigs.rig().fluoroscopes):
@@ -207,7 +207,7 @@ def test_what_does_not_go_together_is_refused():
 
 
 def test_the_command_takes_markers_in_motion(motion, tmp_path, capsys):
-    """Coordinates with a column exposure, K, R and t from the file of this project."""
+    """Coordinates with an exposure column; K, R and t from this project's file."""
     base = 10
     frames = [replace(f, target_id=f.target_id % base) for f in motion.frames]
     write_observations_csv(tmp_path / 'seen.csv', {'a': frames})

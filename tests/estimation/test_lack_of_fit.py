@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What residuals show of a series, and which rejected image points are no false matches."""
+"""Lack of fit of a series from its residuals, and rejected points that are no false matches."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def image_points(count=2400, seed=1):
 
 
 def test_products_are_those_with_neighbours_of_other_exposures():
-    """Of a coordinate: half of the sum over both."""
+    """Products are per coordinate: half of the sum over both coordinates."""
     uv, exposure, rng = image_points(60)
     exposure = exposure // 6
     r = rng.normal(size=(60, 2))
@@ -59,7 +59,7 @@ def test_products_are_those_with_neighbours_of_other_exposures():
 
 
 def test_mean_product_is_as_uncertain_as_exposures_scatter():
-    """Weighted by their image points."""
+    """Exposures are weighted by their number of image points."""
     value = np.array([1.0, 2.0, 3.0, 6.0, 4.0, 5.0])
     exposure = np.array([7, 7, 7, 2, 2, 9])
     products = _Products(np.zeros((6, 2)), value, value, exposure, value, 1.0)
@@ -76,7 +76,7 @@ def test_mean_product_is_as_uncertain_as_exposures_scatter():
 
 
 def products_with(mean, error, part=0.6, distance=20.0):
-    """Products of three exposures with a mean and its standard error."""
+    """Products of three exposures with a given mean and its standard error."""
     spread = np.array([-1.0, 0.0, 1.0]) * error * np.sqrt(3)
     value = np.repeat(mean + spread, 50)
     return _Products(
@@ -127,7 +127,7 @@ def test_products_that_show_nothing_leave_what_is_expected():
 
 
 def test_what_is_left_out_in_places_is_scaled_by_what_these_show():
-    """Bumps where half of the variance is there, and nothing elsewhere."""
+    """Bumps where half of the expected variance is present, and nothing elsewhere."""
     uv, exposure, rng = image_points()
     middle = np.array([300.0, 250.0])
 
@@ -144,7 +144,7 @@ def test_what_is_left_out_in_places_is_scaled_by_what_these_show():
     quiet = rng.normal(0, 0.05, uv.shape)
     nothing = sd_with_lack_of_fit(FittedPoints(uv, quiet, exposure), flat_series(0.01), left_out)
     assert nothing[row, column] < 0.06
-    # Where no image point is, what is expected stays.
+    # Without image points, the expected variance stays.
     away = np.linalg.norm(uv - middle, axis=1) > 320
     there = FittedPoints(uv[away], quiet[away], exposure[away])
     elsewhere = LeftOutInPlaces(lambda at: variance(at) * (len(at) == SD_GRID**2), np.ones_like)
@@ -164,7 +164,7 @@ def test_few_image_points_leave_a_series_what_it_claims():
 
 
 def rejected_points(count, place=None, seed=2):
-    """Rejected image points (n,) of different targets, all over the image or about a place."""
+    """Rejected image points (n,) of different targets, all over the image or around a place."""
     rng = np.random.default_rng(seed)
     uv = (
         rng.uniform(0, 1, (count, 2)) * SIZE
@@ -187,7 +187,7 @@ def test_false_matches_exceed_the_limit_in_hardly_any_area():
         points, rng = rejected_points(300, seed=seed)
         inliers = rng.uniform(0, 1, (3000, 2)) * SIZE
         alarms += bool(exceeding(points, np.arange(300), inliers)[1])
-    assert alarms <= 1  # one of 500 is expected
+    assert alarms <= 1  # the expected rate is one in 500
 
 
 def test_rejected_points_of_one_place_agree():
@@ -199,7 +199,7 @@ def test_rejected_points_of_one_place_agree():
     best = max(wrong, key=lambda area: len(area.rows))
     assert best.size_px == pytest.approx(np.hypot(3.0, 2.0))
     assert len(best.rows) > 16
-    # Opposite residuals, or those of few exposures, agree with nothing.
+    # Opposite residuals, or those of only two exposures, do not agree.
     opposite = common.residuals * np.where(np.arange(24) % 2, 1.0, -1.0)[:, None]
     assert not exceeding(
         FittedPoints(points.uv, opposite, points.exposure), np.arange(24), inliers
@@ -211,7 +211,7 @@ def test_rejected_points_of_one_place_agree():
 
 
 def test_image_points_of_one_target_count_once():
-    """Its survey may be wrong."""
+    """The surveyed coordinates of a single target may be wrong."""
     points, rng = rejected_points(24, (260.0, 200.0))
     inliers = rng.uniform(0, 1, (3000, 2)) * SIZE
     common = np.tile([3.0, -2.0], (24, 1))
@@ -233,7 +233,7 @@ def test_image_points_of_one_target_count_once():
 
 
 def test_areas_overlap_by_half_and_cover_the_image():
-    """A cluster lies in up to four; at a corner of the image in one."""
+    """A cluster lies in up to four areas, at a corner of the image in one."""
     for place, count in (((260.0, 200.0), 4), ((2.0, 2.0), 1), ((2.0, 200.0), 2)):
         uv = np.tile(place, (8, 1)) + np.random.default_rng(3).uniform(0, 1, (8, 2))
         points = FittedPoints(uv, np.ones((8, 2)), np.arange(8))
@@ -241,7 +241,7 @@ def test_areas_overlap_by_half_and_cover_the_image():
 
 
 def test_a_cluster_of_rejected_points_needs_less_to_agree():
-    """Where so many are rejected that this is no chance, the limit is that of one in 20."""
+    """If more points are rejected than by chance, the limit is that of one case in 20."""
     rng = np.random.default_rng(4)
     uv = np.concatenate(
         [rng.uniform(0, 1, (200, 2)) * SIZE, rng.normal((260.0, 200.0), 8.0, (24, 2))]
@@ -261,7 +261,7 @@ def test_a_cluster_of_rejected_points_needs_less_to_agree():
 
 
 def few_at_a_corner(angles, exposure):
-    """Rejected points with residuals of these directions, and the inliers beside and elsewhere."""
+    """Test rejected points with these residual directions among inliers nearby and elsewhere."""
     rng = np.random.default_rng(6)
     uv = rng.uniform(0, 12, (len(angles), 2))
     residuals = 1.3 * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -273,14 +273,14 @@ def few_at_a_corner(angles, exposure):
 
 
 def test_three_rejected_points_that_agree_are_enough_where_hardly_any_others_are():
-    """At a border, where few exposures show anything, a dent rejects few image points."""
+    """At a border that few exposures show, a dent causes few rejected image points."""
     found, wrong = few_at_a_corner([0.7, 0.75, 0.72], [0, 0, 1])
     assert len(found) == len(wrong) == 1 and len(wrong[0].rows) == 3
     assert wrong[0].size_px == pytest.approx(1.3, rel=1e-3)
-    # Those of one exposure, and two, show nothing.
+    # Points of a single exposure, and only two points, show nothing.
     assert not few_at_a_corner([0.7, 0.75, 0.72], [0, 0, 0])[1]
     assert not few_at_a_corner([0.7, 0.75], [0, 1])[0]
-    # Directions of chance exceed the limit in one of 20.
+    # Random directions exceed the limit in one of 20 cases.
     rng = np.random.default_rng(7)
     alarms = sum(
         bool(few_at_a_corner(rng.uniform(0, 2 * np.pi, 3), [0, 1, 2])[1]) for _ in range(200)
@@ -297,7 +297,7 @@ def test_few_rejected_points_among_many_inliers_are_not_looked_at():
 
 
 def test_rejected_points_reach_the_nodes_of_their_cells():
-    """Where inliers are dense, too: a node is at most a cell away."""
+    """Also where inliers are dense: a node is at most a cell away."""
     rng = np.random.default_rng(5)
     size = (3200, 2400)  # cells of 100 px by 75 px
     series = Series(Functions(size, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Places where the signal varies more: their bumps, the gain of a window, and their prior."""
+"""Places where the signal varies more: bumps, gain of a window, and their prior."""
 
 import functools
 from dataclasses import replace
@@ -39,20 +39,20 @@ SMOOTH = Prior(Signal(0.5, 300.0, 1e-3, 200.0), np.zeros(0))
 
 @pytest.fixture(autouse=True, scope='module')
 def one_thread():
-    """As the calibration runs."""
+    """Use one thread, as a calibration does."""
     with threadpool_limits(1):
         yield
 
 
 def place(middle, variance):
-    """A window of 4 x 4 bumps about a middle."""
+    """A window of 4 x 4 bumps about a centre."""
     axis = 32.0 * (np.arange(4) - 1.5)
     nodes = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + middle
     return LocalSignal(nodes, np.zeros(16, dtype=int), np.array([variance]))
 
 
 def drawn(functions, local=None, seed=1, count=2000):
-    """Image points, and values that are drawn from a smooth field with a place (n, 2)."""
+    """Image points, and values (n, 2) drawn from a smooth field with a place."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(0, 1023, (count, 2))
     variance = SMOOTH.signal.variance(functions.frequency)
@@ -64,13 +64,13 @@ def drawn(functions, local=None, seed=1, count=2000):
 
 
 def equations(functions, uv, values):
-    """Information and right side of the coefficients, those of u first."""
+    """Information and right-hand side of the coefficients, those of u first."""
     design = functions(uv) / NOISE
     return np.kron(np.eye(2), design.T @ design), (design.T @ values / NOISE).T.ravel()
 
 
 def test_bumps_are_those_of_the_sines():
-    """Gaussians of 24 px where the sines are short enough for them."""
+    """The bumps are Gaussians of 24 px if the sines are short enough for them."""
     functions = Functions(SIZE, -1, 70)
     nodes = np.array([[300.0, 400.0], [512.0, 700.0]])
     uv = np.random.default_rng(0).uniform(200, 800, (200, 2))
@@ -80,7 +80,7 @@ def test_bumps_are_those_of_the_sines():
 
 
 def test_gain_of_a_window_is_that_of_the_marginal_likelihood():
-    """Of the values themselves, with the whole covariance matrix, before and after."""
+    """The likelihood is that of the values, with the full covariance matrix, before and after."""
     functions = Functions(SIZE, -1, 16)
     uv, values = drawn(functions, place((416.0, 608.0), 0.3), count=500)
     information, right = equations(functions, uv, values)
@@ -109,7 +109,7 @@ def test_gain_of_a_window_is_that_of_the_marginal_likelihood():
 
 @pytest.mark.long
 def test_place_is_found_and_its_variance_estimated():
-    """Where it is, and its variance within a half, mean of several fields."""
+    """The place is located, and its variance is within a half in the mean of several fields."""
     functions = Functions(SIZE, -1, 24)
     there = place((416.0, 608.0), 0.36)
     variances = []
@@ -165,7 +165,7 @@ def test_field_that_is_the_same_everywhere_has_no_place(reach):
 
 
 def test_image_points_that_do_not_determine_the_trend_show_no_place():
-    """All on a line through the middle of the image: most polynomials are zero there."""
+    """All points lie on a line through the image centre, where most polynomials are zero."""
     functions = Functions(SIZE, 3, 18)
     uv = np.column_stack([np.full(100, 511.5), np.linspace(0, 1023, 100)])
     prior = starting_prior(functions, 1.0)
@@ -184,7 +184,7 @@ def test_window_that_nothing_shows_vanishes():
 
 
 def test_prior_of_the_coefficients_holds_the_bumps():
-    """Its precision is the inverse of both covariances."""
+    """The precision of the prior is the inverse of the sum of both covariances."""
     functions = Functions(SIZE, -1, 14)
     local = place((416.0, 608.0), 0.3)
     base = bumps(functions, local.nodes)
@@ -221,7 +221,7 @@ def deep(uv):
 
 @functools.cache
 def dented():
-    """Self-calibrations of a fluoroscope that has all dents and of the same without them."""
+    """Self-calibrations of a fluoroscope with all dents and of the same one without them."""
     frames = [
         replace(f, uv=f.uv + shallow(f.uv) + round_dent(f.uv) + deep(f.uv))
         for f in rigs.exposures()['a'][:10]
@@ -232,7 +232,7 @@ def dented():
 
 @pytest.mark.long
 def test_dent_is_corrected_and_the_rest_stays_precise():
-    """What is claimed elsewhere is as without the dents, within a fifth."""
+    """Elsewhere, the standard deviation grows by less than a fifth over that without dents."""
     run, without_dents = dented()
     uv = run.measured.network.uv
     distance = np.linalg.norm(uv - SHALLOW, axis=1)
@@ -247,7 +247,7 @@ def test_dent_is_corrected_and_the_rest_stays_precise():
 
 @pytest.mark.long
 def test_a_dent_whose_points_were_rejected_is_followed():
-    """Weights that long waves have left reject its image points."""
+    """The weights of a fit with long waves only reject the image points of this dent."""
     run, plain = dented()
     axis = np.linspace(-50, 50, 21)
     uv = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + ROUND
@@ -259,9 +259,9 @@ def test_a_dent_whose_points_were_rejected_is_followed():
 
 @pytest.mark.long
 def test_dent_whose_image_points_look_like_false_matches_is_followed():
-    """They agree with those of other exposures."""
+    """Its image points agree with those of other exposures."""
     run, _ = dented()
     near = np.linalg.norm(run.measured.network.uv - DEEP, axis=1) < 70
     assert near.sum() > 40
     assert run.after.inliers[near].mean() > 0.97
-    assert run.after.inliers.mean() < 0.995  # false matches elsewhere stay out
+    assert run.after.inliers.mean() < 0.995  # false matches elsewhere stay rejected

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Choice of the model, and errors of models by their difference from collocation."""
+"""Choice of the model, and errors of models estimated from their difference to collocation."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -54,7 +54,7 @@ def case(gauge=GaugeKind.FULL, modes=10, **shape):
 
 
 def held_out_densely(design, precision, values, weight, fold):
-    """Predictions (N, 2) by coefficients of functions (N, 2, p) without the own fold."""
+    """Predict values (N, 2) with functions (N, 2, p) fitted to all folds except their own."""
     out = np.empty_like(values)
     for number in np.unique(fold):
         used = fold != number
@@ -101,14 +101,14 @@ def squares(uv):
 
 
 def smooth(uv):
-    """A field (n, 2) [px] that collocation follows, without gauge."""
+    """A field (n, 2) [px] that collocation can follow, without its gauge part."""
     field = 3.0 * np.sin(uv / 75.0)
     flat = gauge_basis(uv, INTERIOR).reshape(2 * len(uv), -1)
     return field - (flat @ np.linalg.lstsq(flat, field.ravel(), rcond=None)[0]).reshape(-1, 2)
 
 
 def calibrated_with(network, before, residuals):
-    """A self-calibration by collocation that has these residuals (N, 2), without correction."""
+    """A self-calibration by collocation with residuals (N, 2) and zero correction."""
     q = np.sum(residuals**2, axis=1) / (0.3 * network.sigma) ** 2
     after = replace(before, residuals=residuals, q=np.minimum(q, 1.0))
     measured = SimpleNamespace(
@@ -130,11 +130,11 @@ def test_a_model_is_better_where_it_predicts_held_out_exposures_better():
     part = terms.parts[0]
     functions = exposure_functions(part.uv, SIZE, part.interior)
     part.own = ExposureTerms(functions, part.exposure, 0.5)
-    assert better_model(stepped, terms) is None  # no other knows what differs
+    assert better_model(stepped, terms) is None  # no other model can follow differences
 
 
 def test_scores_of_models_are_weighted_by_sigma_and_summed_over_fluoroscopes():
-    """Steps that have no weight, by their sigma or beside what is stronger, decide nothing."""
+    """Steps with a low weight, by sigma or next to a stronger signal, do not change the choice."""
     network, before, terms = case(exposures=10, targets=130, fluoroscopes=2)
     noise = np.random.default_rng(4).normal(0, 0.1, network.uv.shape)
     of_second = network.fluoroscope[network.exposure] == 1
@@ -200,14 +200,14 @@ def test_unknowns_state_their_difference_from_those_of_the_reference():
 
 
 def series(uv, field, sd):
-    """A series that is nearly a field at pixels, with a standard deviation [px]."""
+    """A series that approximates a field at pixels, with a standard deviation [px]."""
     functions = Functions(SIZE, 5)
     coefficients = np.linalg.lstsq(functions(uv), field, rcond=None)[0].T
     return Series(functions, coefficients, np.full((SD_GRID, SD_GRID), sd))
 
 
 def errors_by(model, reference, monkeypatch, uv):
-    """The model with its errors by a reference."""
+    """The model with its errors estimated from a reference model."""
     module = 'fluoro_calib_ros.estimation.model_choice._precision_by'
     monkeypatch.setattr(module, lambda *runs: None)
     rows = np.arange(len(uv))
@@ -232,7 +232,7 @@ def test_expected_error_is_the_difference_without_gauge_and_the_variance(monkeyp
     uv = rng.uniform(0, 1023, (900, 2))
     x, y = ((uv - 511.5) / 512).T
     cubic = np.stack([x**3, -x * y], axis=1)
-    # What orientations absorb, of the points to which the model was fitted.
+    # The part that orientations absorb, from the points to which the model was fitted.
     basis = gauge_basis(uv, INTERIOR)
     kept = np.arange(len(uv)) % 7 > 0
     flat = basis[kept].reshape(-1, 6)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Figures of adjustments: statistics, covariances, relative orientations against dense ones."""
+"""Adjustment figures: statistics, covariances and relative orientations, against dense ones."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -52,7 +52,7 @@ SIZE = (1024, 1024)
 
 
 def measured(network, truth):
-    """What was measured of a small network: exposures from 11 on, targets from 101 on."""
+    """Measurements of a small network: exposures from 11 on, targets from 101 on."""
     names = tuple('abc'[: network.n_fluoroscopes])
     per = network.n_exposures // network.n_fluoroscopes
     frames = tuple(
@@ -65,7 +65,7 @@ def measured(network, truth):
 
 
 def case(noise=None, **shape):
-    """Measured, its adjustment and precision."""
+    """The measurements, their adjustment and its precision."""
     network, truth = rigs.small_network(**shape)
     after = adjust(network, truth, noise=noise or Noise('student_t', 0.3, 8.0))
     return measured(network, truth), after, precision(network, after)
@@ -81,7 +81,7 @@ def calibration_of(found, after, precise):
 
 
 def test_statistics_are_those_of_the_whole_adjustment():
-    """Redundancy numbers sum up to observations less unknowns."""
+    """Redundancy numbers sum to the number of observations less that of unknowns."""
     found, after, precise = case(Noise('gaussian', 0.3), exposures=5, targets=30)
     network = found.network
     got = statistics_of(found, after, precise)
@@ -169,7 +169,7 @@ def test_outliers_are_named_with_their_statistics():
 
 @pytest.mark.parametrize('spoilt, found', [((1,), 1), ((1, 2, 3), 0)])
 def test_an_exposure_of_false_matches_is_found_unless_most_are_like_it(spoilt, found):
-    """The median decides; the exposures of the other fluoroscope do not count."""
+    """The median decides; exposures of the other fluoroscope have no influence."""
     network, truth = rigs.small_network(exposures=4, targets=30, fluoroscopes=2)
     start = measured(network, truth)
     after = adjust(network, truth, noise=Noise('student_t', 0.3, 8.0))
@@ -178,7 +178,7 @@ def test_an_exposure_of_false_matches_is_found_unless_most_are_like_it(spoilt, f
         rows = np.flatnonzero(network.exposure == e)
         q[rows[: int(0.6 * len(rows)) + 1]] = 1e4
     rows = np.flatnonzero(network.exposure == 6)
-    q[rows[: len(rows) // 2 - 1]] = 1e4  # more than half fits
+    q[rows[: len(rows) // 2 - 1]] = 1e4  # more than half of the points fit
     run = SimpleNamespace(measured=start, after=replace(after, q=q))
     findings = exposures_that_do_not_fit(run)
     assert len(findings) == found
@@ -197,7 +197,7 @@ def test_rounds_settle_where_costs_and_correction_do():
     assert not _has_settled(rounds()[:1], 1.0)
     assert _has_settled(rounds(), 1e-4)
     for sign in (-1, 1):
-        assert _has_settled(rounds(f=sign * 0.09), 1e-4)  # relative to the larger of both
+        assert _has_settled(rounds(f=sign * 0.09), 1e-4)  # relative to the larger of both costs
         assert not _has_settled(rounds(f=sign * 0.11), 1e-4)
         assert _has_settled(rounds(g=sign * 0.09), 1e-4)
         assert not _has_settled(rounds(g=sign * 0.11), 1e-4)
@@ -258,7 +258,7 @@ def test_covariance_of_all_unknowns_equals_the_dense_inverse():
 
 
 def test_covariances_are_scaled_to_what_the_unknowns_claim():
-    """Correlations stay, and what was fixed has no variance."""
+    """Correlations stay unchanged, and fixed unknowns have no variance."""
     network, truth = rigs.small_network(exposures=3, targets=12, free=False)
     found = measured(network, truth)
     after = adjust(network, truth, noise=Noise('student_t', 0.3, 8.0))
@@ -302,7 +302,7 @@ def test_fixed_interiors_are_uncertain_in_the_covariance_of_all_unknowns():
 def joint_case():
     network, truth = rigs.small_network(exposures=3, targets=25, fluoroscopes=2, seed=4)
     pairs = np.array([[0, 3], [1, 4], [2, 5]])
-    # One relative orientation for all pairs.
+    # One relative orientation serves all pairs.
     turn, shift = relative_poses(truth, pairs)
     rotation, position = truth.rotation.copy(), truth.position_mm.copy()
     rotation[3:] = turn[0] @ rotation[:3]
@@ -311,7 +311,7 @@ def joint_case():
 
 
 def test_covariance_of_a_mean_relative_orientation_equals_the_dense_one():
-    """By finite differences of the weighted mean, over all unknowns of the adjustment."""
+    """Reference: finite differences of the weighted mean, over all unknowns of the adjustment."""
     network, truth = rigs.small_network(exposures=3, targets=25, fluoroscopes=2, seed=4)
     found = measured(network, truth)
     after = adjust(network, truth, noise=Noise('student_t', 0.3, 8.0))
@@ -348,7 +348,7 @@ def test_covariance_of_a_mean_relative_orientation_equals_the_dense_one():
     np.testing.assert_allclose(pose.rotation, expected.rotation, atol=1e-5)
 
     def mean(parameters):
-        # The linear one, about the pose at which the weights belong to the discrepancies.
+        # Linear mean, about the pose at which the weights belong to the discrepancies.
         total = np.linalg.inv(weights.sum(axis=0))
         return total @ np.einsum('kab,kb->a', weights, off(parameters, middle))
 
@@ -411,7 +411,7 @@ def test_constrained_relative_orientations_are_those_of_the_adjustment():
 
 
 def test_constraints_of_a_free_network_follow_its_scale():
-    """And targets of fewer than three rays are left out."""
+    """Targets with fewer than three rays are excluded, too."""
     network, truth, _ = joint_case()
     keep = (network.point != 7) | (np.cumsum(network.point == 7) <= 2)
     keep &= (network.point != 3) | (np.cumsum(network.point == 3) <= 3)
@@ -491,7 +491,7 @@ def test_interiors_are_estimated_unless_known_or_not_shown():
     np.testing.assert_array_equal(got.interior_sd[2], [np.inf] * 3)
 
 
-# ---- with calibrations fixed
+# ---- with fixed calibrations
 
 
 def test_noise_of_calibrations_is_that_of_the_median():
@@ -502,7 +502,7 @@ def test_noise_of_calibrations_is_that_of_the_median():
 
 
 def test_image_points_are_weighted_by_what_a_calibration_claims_there():
-    """By the profile of its noise where they have no sigma, and by its correction everywhere."""
+    """The noise profile applies to points without sigma, the sd of the correction to all."""
     network, truth = rigs.small_network(3, 20, 2)
     start = measured(network, truth)
     told = np.full(20, 0.7)
@@ -543,7 +543,7 @@ def test_noise_needs_three_rays_of_a_target(rays, few):
 
 
 def test_a_rough_survey_rejects_no_image_points():
-    """Its errors are 30 px in the image; a robust adjustment from the survey would keep them."""
+    """Survey errors are 30 px in the image; a robust adjustment started there would keep them."""
     network, truth = rigs.small_network(exposures=6, targets=60, survey_sd_mm=12.0, free=False)
     noise = Noise('student_t', 0.3, 8.0, gross=0.01)
     start = replace(truth, points_mm=network.survey_mm)
@@ -578,7 +578,7 @@ def test_rays_of_a_bead_are_counted_with_their_largest_angle():
 
 
 def test_scale_of_given_coordinates_is_as_uncertain_as_they_are():
-    """Against a Monte Carlo of their least-squares scale."""
+    """Compare with a Monte Carlo of the least-squares scale of the coordinates."""
     rng = np.random.default_rng(3)
     given = rng.normal(0, 50.0, (8, 3)) + [100.0, 0, 0]
     sd = rng.uniform(0.2, 1.0, 8)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Orientation of a rig from a capture or exposures, its file, and the commands that use it."""
+"""Orientation of a rig from a capture or from exposures, its file, and the commands using it."""
 
 import csv
 import json
@@ -54,7 +54,7 @@ NOISE_PX = 0.25
 
 
 def capture(of_rig=None, count=1, seed=3, pose=(np.eye(3), np.zeros(3)), false_matches=0.01):
-    """Frames by fluoroscope of the phantom standing in a pose."""
+    """Frames by fluoroscope of the phantom standing in one pose."""
     of_rig = of_rig or rig()
     rng = np.random.default_rng(seed)
     points = of_rig.true_mm @ pose[0].T + pose[1]
@@ -77,12 +77,12 @@ def capture(of_rig=None, count=1, seed=3, pose=(np.eye(3), np.zeros(3)), false_m
 
 
 def calibrations():
-    """Calibrations of the fluoroscopes of the rig of the tests."""
+    """Calibrations of the fluoroscopes of the test rig."""
     return {name: calibrated(name).calibrations[name] for name in ('a', 'b')}
 
 
 def without_distortion(seed=1):
-    """A virtual rig without distortion; the seed draws a new survey."""
+    """A virtual rig without distortion; the seed selects a new survey."""
     still = virtual_rig(1, strength=0.0)
     survey = still.true_mm + np.random.default_rng(seed).normal(0, 0.1, still.true_mm.shape)
     return VirtualRig(
@@ -122,7 +122,7 @@ def normalised(step, covariance):
 
 
 def test_errors_of_points_after_a_capture_agree_with_their_covariances():
-    """Moving markers with estimated corrections; few false matches remain."""
+    """Moving markers with estimated corrections; few false matches remain undetected."""
     orientation = orientation_of_capture(capture(), rig().phantom, calibrations())
     assert (
         orientation.source == 'capture'
@@ -145,7 +145,7 @@ def test_errors_of_points_after_a_capture_agree_with_their_covariances():
 
 
 def test_covariance_of_a_capture_against_monte_carlo():
-    """Noise, survey and held interior orientations: full covariance of all 18 unknowns."""
+    """Noise, survey and fixed interior orientations: full covariance of all 18 unknowns."""
     squares = []
     for seed in range(40):
         still = without_distortion(seed)
@@ -168,7 +168,7 @@ def test_covariance_of_a_capture_against_monte_carlo():
 
 
 def test_frames_of_a_capture_are_averaged():
-    """In any order; a false match does no harm, and the noise is that of the mean."""
+    """Order does not matter, a false match does no harm, and the noise is that of the mean."""
     frames = capture(count=12, false_matches=0.0)
     one = orientation_of_capture(
         {n: f[:1] for n, f in frames.items()}, rig().phantom, calibrations()
@@ -268,7 +268,7 @@ def test_invalid_capture_is_refused_in_one_sentence(change, sentence):
 
 
 def test_covariance_of_a_relative_orientation_against_monte_carlo():
-    """In the datum of points at the place of the phantom: 12 of the 18 unknowns remain in a fixed
+    """In the datum of points at the place of the phantom; 12 of the 18 unknowns remain in a fixed
     frame.
     """
     squares = []
@@ -301,8 +301,8 @@ def test_covariance_of_a_relative_orientation_against_monte_carlo():
 
 
 def test_datum_removes_only_the_common_motion_of_points():
-    """Distances keep their variances, centre and attitude of the points have none; a second
-    transformation changes nothing.
+    """Distances keep their variances; centre and attitude of the points have none. Applying the
+    transformation twice changes nothing.
     """
     found = orientation_and_scatter(exposures(), rig().phantom, calibrations())[0]
     rng = np.random.default_rng(1)
@@ -333,7 +333,7 @@ def test_datum_removes_only_the_common_motion_of_points():
 
 
 def moved_orientation(orientation, step):
-    """The orientation with its unknowns moved by step (18,)."""
+    """The orientation after a change of its unknowns by step (18,)."""
     step = step.reshape(-1, 9)
     return replace(
         orientation,
@@ -382,12 +382,12 @@ def test_exposures_that_do_not_belong_together_are_refused():
 
 @pytest.fixture(scope='module')
 def found():
-    """An orientation of the rig of the tests."""
+    """An orientation of the test rig."""
     return orientation_of_capture(capture(), rig().phantom, calibrations())
 
 
 def test_file_round_trip_is_exact(tmp_path, found):
-    """Orientation and bytes are the same after reading and writing."""
+    """The orientation and the bytes of the file are the same after reading and writing."""
     path = save_orientation(tmp_path / 'new' / 'folder', found)
     content = Path(path).read_bytes()
     again = load_orientation(path)
@@ -445,7 +445,7 @@ def test_invalid_files_are_refused_in_one_sentence(tmp_path, found, change, sent
 
 
 def test_damaged_files_are_refused(tmp_path, found):
-    """A wrong byte or a truncation anywhere; a failed write keeps the earlier file."""
+    """A wrong byte or a truncation is found anywhere; a failed write keeps the earlier file."""
     path = save_orientation(tmp_path, found)
     content = pathlib.Path(path).read_bytes()
     rng = np.random.default_rng(0)
@@ -456,7 +456,7 @@ def test_damaged_files_are_refused(tmp_path, found):
         try:
             assert (
                 load_orientation(path).orientation_id == found.orientation_id
-            )  # a byte that nothing is read from
+            )  # a byte that no value is read from
         except DataError as error:
             assert str(path) in str(error)
     for size in (0, 10, len(content) // 2, len(content) - 1):
@@ -505,8 +505,8 @@ def said(capsys, *arguments):
 
 
 def test_calibrate_writes_an_orientation(folder, tmp_path, capsys):
-    """From exposures that belong together; a capture whose calibrations did not change keeps its
-    orientation.
+    """Exposures of one group give an orientation; a capture whose calibrations did not change
+    keeps its orientation.
     """
     assert run('simulate', '--out', tmp_path / 'rig', '--exposures', 4, '--seconds', 0) == 0
     write = (
@@ -544,7 +544,7 @@ def test_calibrate_writes_an_orientation(folder, tmp_path, capsys):
     assert path.read_bytes() == captured
     assert (
         run(*write, '--out', tmp_path / 'both') == 0
-    )  # other calibrations: the capture belongs to them no more
+    )  # after new calibrations, the orientation by the capture is invalid
     assert load_orientation(path).source == 'joint calibration'
     capsys.readouterr()
     table = tmp_path / 'apart.csv'
@@ -576,7 +576,7 @@ def test_calibrate_writes_an_orientation(folder, tmp_path, capsys):
 
 
 def test_orient_and_reconstruct(folder, tmp_path, capsys):
-    """From a bag: points in the frame of the standing phantom agree with the truth within their
+    """Points from a bag, in the frame of the standing phantom, agree with the truth within their
     standard deviations.
     """
     result = folder / 'result'
@@ -687,7 +687,7 @@ def test_reconstruct_reports_what_is_missing(folder, tmp_path, capsys):
 
 
 def test_reconstruct_refuses_invalid_input_in_one_sentence(folder, tmp_path, capsys):
-    """It writes nothing."""
+    """The command writes no file."""
     result = folder / 'result'
     out = tmp_path / 'out.csv'
     other = tmp_path / 'other'
@@ -720,7 +720,7 @@ def test_reconstruct_refuses_invalid_input_in_one_sentence(folder, tmp_path, cap
 
 
 def test_orient_refuses_invalid_input_in_one_sentence(folder, capsys):
-    """The existing orientation stays."""
+    """The existing orientation is kept."""
     result = folder / 'result'
     before = (result / 'rig_orientation.npz').read_bytes()
     given = ('--phantom', folder / 'phantom.csv', '--calibration', result)
@@ -737,7 +737,7 @@ def test_orient_refuses_invalid_input_in_one_sentence(folder, capsys):
 
 
 def test_one_exposure_can_define_the_rig_frame(folder, tmp_path):
-    """The frame is that of the phantom in this exposure."""
+    """The rig frame is that of the phantom in this exposure."""
     copy = tmp_path / 'result'
     copy.mkdir()
     for path in (folder / 'result').glob('*.calibration.npz'):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which pairs of exposures agree on a relative orientation, and how the others are off."""
+"""Pairs of exposures that agree on a relative orientation, and the deviations of the others."""
 
 from dataclasses import replace
 
@@ -55,7 +55,7 @@ def noise(count, seed=2):
 
 
 def by_definition(parameters, constraint, weights, used):
-    """Deviations (k,) over their sd about the mean of the used pairs, and their growth."""
+    """Deviations (k,) from the mean of the used pairs, over their sd, and their growth factor."""
     pose = mean_pose(parameters, constraint.pairs[used], weights[used])
     off = discrepancies(constraint, pose, parameters) / SD
     chi2 = np.sum(off[used] ** 2) / (6 * (used.sum() - 1))
@@ -90,7 +90,7 @@ def test_a_pair_that_contradicts_the_others_is_left_out():
 
 @pytest.mark.parametrize('wrong, kept', [(6, False), (7, True)])
 def test_no_pair_is_left_out_where_too_many_contradict(wrong, kept):
-    """A third of 20 are six."""
+    """At most a third of the pairs, six of 20, may be excluded."""
     off = noise(20)
     off[:wrong] += np.outer(np.linspace(100, 400, wrong) * (-1) ** np.arange(wrong), SD)
     assert agreeing(*scattered(off), np.ones((20, 1))).used[:wrong].all() == kept
@@ -114,7 +114,7 @@ def test_one_pair_tells_no_scatter():
 
 
 def turning(seed=2):
-    """Discrepancies (k, 6) that follow the angles, and the functions of these."""
+    """Discrepancies (k, 6) that follow the angles, and the functions of the angles."""
     columns = functions_of_angles([ANGLES, ANGLES])
     by_angle = np.random.default_rng(3).normal(0, 40.0, (columns.shape[1] - 1, 6)) * SD
     return (columns - columns.mean(axis=0))[:, 1:] @ by_angle + noise(20, seed), columns, by_angle
@@ -135,7 +135,7 @@ def test_what_follows_the_angle_is_no_scatter():
 
 
 def test_scatter_that_the_angle_does_not_explain_stays():
-    """Half of the variance is not enough to believe in the angle."""
+    """Explaining half of the variance is not enough to accept the angle as the cause."""
     _, columns, _ = turning()
     case = scattered(5 * noise(20, 7))
     found = agreeing(*case, columns)
@@ -145,7 +145,7 @@ def test_scatter_that_the_angle_does_not_explain_stays():
 
 
 def test_pairs_about_a_step_are_no_single_exposures():
-    """The rig was moved before the last four exposures."""
+    """The rig was moved before the last four exposures, so none of them is excluded."""
     off, columns, _ = turning()
     off[16:] += 200 * SD
     found = agreeing(*scattered(off), columns)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Priors of trend, places and ripples: those of the largest marginal likelihood."""
+"""Priors of trend, places and ripples are those of the largest marginal likelihood."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -53,20 +53,20 @@ SMOOTH = Signal(0.5, 300.0, 1e-3, 200.0)
 
 @pytest.fixture(autouse=True, scope='module')
 def one_thread():
-    """As the calibration runs."""
+    """Use one thread, as a calibration does."""
     with threadpool_limits(1):
         yield
 
 
 def observed(functions, uv, field, seed=1):
-    """Information and right side of the coefficients of a field (n, 2) with noise."""
+    """Information and right-hand side of the coefficients of a field (n, 2) with noise."""
     values = field + np.random.default_rng(seed).normal(0, NOISE, field.shape)
     design = functions(uv) / NOISE
     return np.kron(np.eye(2), design.T @ design), (design.T @ values / NOISE).T.ravel()
 
 
 def evidence(functions, information, right, prior):
-    """Logarithm of the marginal likelihood, without constants."""
+    """Logarithm of the marginal likelihood, up to a constant."""
     precision = information + prior_precision(functions, prior)
     of_prior = -np.sum(np.log(prior.trend))
     if functions.modes:
@@ -81,7 +81,7 @@ def image_points(count=1200, seed=3, size=SIZE):
 
 @pytest.mark.parametrize('modes', [0, 8])
 def test_variances_of_the_trend_are_the_most_likely_ones(modes):
-    """Whatever variance is changed, the likelihood falls; those of rings are all or nothing."""
+    """Any other variance lowers the likelihood; rings exist either with all terms or with none."""
     functions = Functions(SIZE, 3, modes, 2)
     uv = image_points()
     xy = (uv - 511.5) / 512
@@ -89,7 +89,7 @@ def test_variances_of_the_trend_are_the_most_likely_ones(modes):
     field = np.stack([3 * x**3 - 2 * y * y, x * y - 0.3 * x * x], axis=1)
     field += 2.0 * np.sum(xy**2, axis=1, keepdims=True) ** 2 * xy
     information, right = observed(functions, uv, field)
-    # Orientations are known but for the gauge, whose terms have no prior.
+    # Orientations are known up to the gauge, whose terms have no prior.
     prior = replace(starting_prior(functions, 1.0), signal=Signal(0.2, 300.0))
     for _ in range(12):
         prior = _most_likely_trend(functions, information, right, prior)
@@ -99,7 +99,7 @@ def test_variances_of_the_trend_are_the_most_likely_ones(modes):
     assert (prior.trend[[15, 16, 17, 19, 20, 21]] <= ABSENT_VARIANCE * 1.01).sum() >= 5
     for j in range(14):
         for factor in (0.7, 1.4):
-            if prior.trend[j] * factor > 1e-3:  # others are as small as they may be
+            if prior.trend[j] * factor > 1e-3:  # others are at their lower bound
                 trend = prior.trend.copy()
                 trend[j] *= factor
                 other = replace(prior, trend=trend)
@@ -127,7 +127,7 @@ def test_rings_exist_by_the_variances_of_their_terms_alone():
 
 
 def test_prior_of_the_trend_is_that_of_its_terms():
-    """In terms it is diagonal, and what the gauge holds has none."""
+    """In terms, the precision is diagonal; terms of the gauge have no prior."""
     functions = Functions(SIZE, 3, 5, 1)
     variance = np.random.default_rng(4).uniform(0.1, 5.0, 18)
     precision = prior_precision(functions, Prior(SMOOTH, variance))
@@ -145,7 +145,7 @@ def test_prior_of_the_trend_is_that_of_its_terms():
 
 
 def test_uncertain_terms_of_a_series_are_those_that_can_exist():
-    """The covariance grows by what is not known of polynomials and of two terms of a ring."""
+    """The covariance grows by the uncertain polynomials and by two terms of a ring."""
     functions = Functions(SIZE, 3, 4, 1)
     uv = image_points(300)
     information, right = observed(functions, uv, np.zeros((300, 2)))
@@ -169,7 +169,7 @@ def test_uncertain_terms_of_a_series_are_those_that_can_exist():
 
 
 def drawn_field(functions, rng):
-    """Coefficients (2, s) of a field whose covariance function is drawn, too."""
+    """Coefficients (2, s) of a field whose covariance function is drawn as well."""
     signal = Signal(
         float(rng.lognormal(np.log(0.3), 0.7)),
         float(rng.lognormal(np.log(300), 0.4)),
@@ -179,7 +179,7 @@ def drawn_field(functions, rng):
 
 
 def estimated_prior(functions, information, right):
-    """The most likely prior of a signal without trend."""
+    """The most likely prior of a signal without a trend."""
     prior = Prior(starting_signal(0.3, max(SIZE)), np.zeros(0))
     for _ in range(30):
         before = prior
@@ -192,7 +192,7 @@ def estimated_prior(functions, information, right):
 
 
 def normalized_squares(functions, error, covariances):
-    """Mean squares of the errors of a field over their claimed variances, by covariance matrix."""
+    """Mean squared errors of a field over their claimed variances, for each covariance matrix."""
     values = functions(image_points(200, seed=9))
     at = np.kron(np.eye(2), values)
     return [np.mean((at @ error) ** 2 / np.sum(at @ c * at, axis=1)) for c in covariances]
@@ -200,7 +200,7 @@ def normalized_squares(functions, error, covariances):
 
 @pytest.mark.parametrize(('count', 'too_small'), [(40, (1.3, 1.7)), (400, (0.95, 1.15))])
 def test_claims_hold_where_the_signal_is_only_estimated(count, too_small):
-    """Errors of drawn fields: with few image points, the most likely signal claims too little."""
+    """With few image points, the most likely signal alone understates the errors."""
     functions = Functions(SIZE, -1, 6)
     rng = np.random.default_rng(1)
     uv = image_points(count)
@@ -222,7 +222,7 @@ def test_claims_hold_where_the_signal_is_only_estimated(count, too_small):
 
 
 def test_a_series_without_sines_has_no_signal_to_be_estimated():
-    """Nothing is added to its covariance."""
+    """The covariance of the series does not grow."""
     functions = Functions(SIZE, 3, 0)
     information, right = observed(functions, image_points(300), np.zeros((300, 2)))
     prior = Prior(SMOOTH, np.ones(14))
@@ -234,7 +234,7 @@ def test_a_series_without_sines_has_no_signal_to_be_estimated():
 
 
 def place(middle, variance):
-    """A window of 4 x 4 bumps about a middle."""
+    """A window of 4 x 4 bumps about a centre."""
     axis = 32.0 * (np.arange(4) - 1.5)
     nodes = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + middle
     return LocalSignal(nodes, np.zeros(16, dtype=int), np.array([variance]))
@@ -269,7 +269,7 @@ def test_variance_of_a_place_is_the_most_likely_one():
 
 @pytest.mark.parametrize('of_v', [1.0, 0.3])
 def test_more_places_are_those_that_raise_the_likelihood_most(of_v):
-    """Where v is less certain than u, too: dense, window by window, against the first found."""
+    """Also if v is less certain than u. Reference: dense solutions with the first place found."""
     functions = Functions(SIZE, 3, 14)
     uv = image_points(500)
     information, right = observed(functions, uv, np.zeros((500, 2)))
@@ -295,7 +295,7 @@ def test_more_places_are_those_that_raise_the_likelihood_most(of_v):
         assert less - before < gain + 0.01
     beside = replace(first, nodes=first.nodes + [200.0, -200.0])
     assert evidence(functions, information + gauge, right, replace(prior, local=beside)) < before
-    # A prior that has the place finds no stronger one.
+    # A search with the found places in the prior adds at most one place.
     more = with_more_places(functions, information, right, gauge, replace(prior, local=found))
     assert len(more.local.variances) <= len(found.variances) + 1
 
@@ -311,7 +311,7 @@ def test_places_that_image_points_show_are_found_with_a_signal_estimated_anew():
     own = found.local.nodes[found.local.window == 0]
     assert np.abs(own - (416.0, 608.0)).max() < 130
     assert found.signal != prior.signal
-    # Orientations known, no prior of the trend: the solution of these equations.
+    # With known orientations and no prior of the trend, these equations give the solution.
     design = functions(uv) / NOISE
     t = functions.trend
     matrix = design.T @ design
@@ -372,13 +372,13 @@ def test_bands_are_strips_in_all_directions_that_cover_the_image():
         assert width.min() <= 2 * 1.5 * 32.0 + 1e-6
         found.append(np.argmin(width))
     assert (np.bincount(found, minlength=32) >= 15).all()
-    # They overlap by half: each bump that is not at an edge is in two or three of every direction.
+    # Bands overlap by half: each inner bump lies in two or three bands of every direction.
     number = bands[:, np.abs(nodes - 512).max(axis=1) < 400].sum(axis=0)
     assert 2 * 32 <= number.min() <= number.max() <= 3 * 32
 
 
 def test_what_sines_leave_out_of_a_place_are_its_short_waves():
-    """By the sines beyond: sums of their squares, and their correlation."""
+    """Reference: square sums of the sines beyond the series, and their correlation."""
     some = Functions(SIZE, -1, 18)
     many = Functions(SIZE, -1, 60)
     local = place((512.0, 512.0), 0.5)
@@ -436,7 +436,7 @@ def test_renewed_variances_of_places_are_squares_over_what_is_determined():
 
 
 def candidates(monkeypatch, windows, band=None):
-    """Let all that image points show be these places of bumps: (corner [bumps], gain)."""
+    """Pretend that the image points show exactly these places: (corner [bumps], gain)."""
     nodes = _all_nodes(SIZE)
 
     def window(corner, gain, variance=0.3):
@@ -453,20 +453,20 @@ def candidates(monkeypatch, windows, band=None):
 
 
 def corners(local):
-    """Windows of places by their first bump, in their order."""
+    """Windows of places, in order, each given by its first bump."""
     count = len(local.variances)
     first = [local.nodes[local.window == w].min(axis=0) for w in range(count)]
     return [tuple(np.rint((one - 16) / 32).astype(int).tolist()) for one in first]
 
 
 def test_a_window_beside_a_place_needs_less_gain_than_one_anywhere(monkeypatch):
-    """An edge goes on; no bump is taken twice."""
+    """An edge continues; no bump is used twice."""
     windows = [
-        ((20, 8), 5.0),  # nowhere beside
-        ((12, 8), 2.0),  # beside
+        ((20, 8), 5.0),  # not next to a place
+        ((12, 8), 2.0),  # next to a place
         ((8, 8), 9.0, 0.7),
-        ((4, 8), 1.0),  # beside, but too little
-        ((10, 10), 8.0),  # some of its bumps are taken
+        ((4, 8), 1.0),  # next to a place, but the gain is too small
+        ((10, 10), 8.0),  # some of its bumps are used already
         ((8, 26), 6.5),
         ((12, 12), 3.0),  # at a corner
     ]
@@ -481,7 +481,7 @@ def test_a_window_beside_a_place_needs_less_gain_than_one_anywhere(monkeypatch):
 
 
 def test_a_band_is_added_alone_where_it_gains_most(monkeypatch):
-    """What windows gain is known again when it is in the prior."""
+    """Gains of windows must be computed anew once the band is in the prior."""
     local = place((416.0, 608.0), 0.5)
     for gain, added in ((10.0, [(1, 1)]), (8.0, [(8, 8)]), (5.0, [(8, 8)])):
         found = candidates(monkeypatch, [((8, 8), 9.0)], ((1, 1), gain))(local)
@@ -491,7 +491,7 @@ def test_a_band_is_added_alone_where_it_gains_most(monkeypatch):
 
 
 def test_the_band_that_gains_most_leaves_out_what_is_taken():
-    """Edges along v and along u; once the first is taken, the other is found."""
+    """Edges along v and along u: once the first is taken, the other one is found."""
     functions = Functions(SIZE, -1, 18)
     uv = image_points(1500, 6)
     field = 0.9 * np.tanh((uv[:, :1] - 400.0) / 5) * [0.6, -0.8]

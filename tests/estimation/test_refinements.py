@@ -27,7 +27,7 @@ SIZE = (1024, 1024)
 
 
 def solution(reach=300.0, is_steady=True, level=1e2, own=None):
-    """A solution with 16 sines along the image and a field of a correlation length [px]."""
+    """A solution with 16 sines along the image, for a field with correlation length reach [px]."""
     functions = Functions(SIZE, 3, 16)
     prior = Prior(Signal(0.5, reach), np.zeros(14))
     part = SimpleNamespace(number=0, functions=functions, prior=prior, own=own)
@@ -37,7 +37,7 @@ def solution(reach=300.0, is_steady=True, level=1e2, own=None):
 
 
 def test_as_many_sines_as_the_image_points_can_tell():
-    """A shorter field and more image points need more of them."""
+    """A shorter correlation length and more image points require more sines."""
     long, short = (NumberOfSines().propose(solution(reach)).modes[0] for reach in (400.0, 150.0))
     assert long < short <= MAX_MODES
     more = NumberOfSines().propose(solution(400.0, level=1e4)).modes[0]
@@ -45,7 +45,7 @@ def test_as_many_sines_as_the_image_points_can_tell():
 
 
 def test_the_number_of_sines_changes_a_few_times_and_anew_where_exposures_differ():
-    """What varies may have passed for a short signal."""
+    """A difference between exposures may have been mistaken for a short signal."""
     refinement = NumberOfSines()
     found = [refinement.propose(solution(100.0)) for _ in range(MODE_CHANGES + 1)]
     assert [change is not None for change in found] == [True] * MODE_CHANGES + [False]
@@ -53,7 +53,7 @@ def test_the_number_of_sines_changes_a_few_times_and_anew_where_exposures_differ
 
 
 def test_few_sines_less_are_not_worth_a_change():
-    """But the first number is only a start."""
+    """The first number of sines is only an initial value, though."""
     reaches = np.arange(100.0, 900.0, 10.0)
     first = {reach: NumberOfSines().propose(solution(reach)) for reach in reaches}
     fewer = [reach for reach, change in first.items() if change and 12 <= change.modes[0] < 16]
@@ -63,7 +63,7 @@ def test_few_sines_less_are_not_worth_a_change():
 
 
 def test_a_change_is_looked_for_once_at_steady_priors():
-    """Whether it is found or not."""
+    """The search is not repeated, whether it finds a change or not."""
     for found in (None, 'change'):
         tried = []
 
@@ -81,7 +81,7 @@ def test_a_change_is_looked_for_once_at_steady_priors():
 
 @pytest.mark.parametrize('refinement', [MorePlaces(0), MorePlaces()])
 def test_a_prior_is_not_searched_where_that_is_done_or_nothing_is_there(refinement):
-    """A given prior was refined where it was estimated; places beside none are none."""
+    """A given prior was refined when it was estimated; without a place, none is next to one."""
     there = solution()
     part = there.parts[0]
     assert refinement.propose(part, there.equations[0], part.prior) is None
@@ -94,7 +94,7 @@ def test_exposures_get_terms_of_their_own_only_where_they_differ(varies):
     exposure = np.repeat(np.arange(6), 100)
     interior = np.array([511.5, 511.5, 4000.0])
     residuals = rng.normal(0, 0.1, uv.shape)
-    for own in np.arange(600).reshape(6, 100):  # orientations and beads take up a part of them
+    for own in np.arange(600).reshape(6, 100):  # orientations and beads absorb a part
         q, _ = np.linalg.qr(exposure_functions(uv, (1024, 1024), interior)[own].reshape(200, -1))
         residuals[own] -= (0.5 * q @ (q.T @ residuals[own].ravel())).reshape(-1, 2)
     if varies:  # a stretch along the diagonal that changes from exposure to exposure

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The regressors: scikit-learn's checks, agreement with the models, and regressors of users."""
+"""The regressors: scikit-learn's checks, agreement with the models, and user-defined ones."""
 
 import inspect
 import json
@@ -40,7 +40,7 @@ from fluoro_calib_ros.io.phantom import write_phantom
 SIZE = (640, 480)
 REGRESSORS = [(KnnModel, KnnRegressor), (LocalLinearModel, LocalLinearRegressor)]
 
-# Neighbours are counted, not weighed: a sample of weight 2 is one neighbour, two samples are two.
+# Neighbours are counted, not weighted: a sample of weight 2 is one, two samples are two.
 COUNTED = 'k is a number of samples, whatever their weights'
 EXPECTED_FAILURES = {
     KnnRegressor: {
@@ -59,7 +59,7 @@ def training(n=600, seed=0, noise=0.2):
 
 
 def failed_checks_of_old_version(regressor):
-    """Names of the checks of scikit-learn that an estimator fails."""
+    """Names of the scikit-learn checks that an estimator fails."""
     from sklearn.utils.estimator_checks import check_estimator
 
     failed = set()
@@ -121,7 +121,7 @@ def test_sample_of_weight_zero_is_ignored(regressor):
 
 
 def test_neighbours_count_by_their_sample_weights():
-    """Those of the mean, and those of trend and planes, by weighted least squares."""
+    """Compare means, trend and planes with weighted least squares."""
     uv, duv, _ = training(200)
     rng = np.random.default_rng(8)
     weight = rng.uniform(0.2, 3.0, 200)
@@ -188,7 +188,7 @@ def test_cross_validation_with_whole_exposures_held_out(model, regressor):
 
 
 def lookup_model(size=(100, 60)):
-    """A model whose grid has the values of a bilinear function, calibrated on a part of it."""
+    """A model with a grid of values of a bilinear function, calibrated on a part of it."""
     rng = np.random.default_rng(4)
     inside = rng.uniform([20, 10], [70, 50], (200, 2))
     uv = np.concatenate([grid_nodes(size), hull_corners(inside)])
@@ -253,7 +253,7 @@ def test_calibration_with_a_user_regressor(tmp_path):
     part = gauge_coefficients(
         uv[run.trained], run.correction[run.trained], run.after.parameters.interior[0]
     )
-    assert np.max(np.abs(part)) < 0.01  # of several px
+    assert np.max(np.abs(part)) < 0.01  # fitted values are several px
     loaded = load_calibration(save_calibration(str(tmp_path), calibration))
     assert loaded.calibration_id == calibration.calibration_id
     query = np.random.default_rng(7).uniform(-0.5, 1023.5, (3000, 2))
@@ -269,7 +269,7 @@ def test_calibration_with_a_user_regressor(tmp_path):
 
 
 def test_random_regressor_gives_reproducible_results():
-    """A single-output regressor with random_state=None is seeded and fitted to each output."""
+    """A single-output regressor with random_state=None is seeded, and fitted once per output."""
     regressor = DecisionTreeRegressor(max_features=1, min_samples_leaf=10)
     one, other = (calibrated_with(regressor, max_iterations=1).calibrations['a'] for _ in range(2))
     assert one.calibration_id == other.calibration_id
@@ -300,7 +300,7 @@ def test_name_that_is_no_regressor_is_refused(name, message):
 
 
 def test_names_of_classes_are_refused_from_files_and_messages(tmp_path):
-    """They would run code of the author of the file or message."""
+    """Class names would run code chosen by the author of the file or message."""
     with pytest.raises(ValueError, match='only on the command line and in Python') as error:
         CalibrationOptions('sklearn.tree:DecisionTreeRegressor')
     assert '\n' not in str(error.value)
@@ -333,7 +333,7 @@ def test_lookup_cannot_be_selected():
 
 
 def test_command_calibrates_with_a_user_regressor(tmp_path, capsys):
-    """The result folder names it; reading the folder never runs it."""
+    """The result folder stores its name; reading the folder never runs it."""
     write_observations_csv(tmp_path / 'points.csv', {'a': rigs.exposures()['a'][:6]})
     write_phantom(tmp_path / 'phantom.csv', rigs.rig().phantom)
     source = ['--phantom', tmp_path / 'phantom.csv', '--image-size', '1024x1024']

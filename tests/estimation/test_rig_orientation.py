@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Orientation of a rig: dense covariances, means of frames, and pairs that are used."""
+"""Orientation of a rig: dense covariances, averaged frames, and selection of pairs."""
 
 from dataclasses import replace
 from types import SimpleNamespace as Fake
@@ -44,7 +44,7 @@ NAMES = ('a', 'b')
 
 
 def rig_without_distortion(targets=60):
-    """A rig without distortion, of some targets, and its calibrations with uncertain interiors."""
+    """A rig without distortion, with few targets, and its uncertain calibrations."""
     rig = virtual_rig(1, strength=0.0)
     kept = np.random.default_rng(2).permutation(len(rig.true_mm))[:targets]
     kept.sort()
@@ -97,7 +97,7 @@ def assert_same_covariance(found, expected, atol=1e-4):
 
 
 def test_covariance_of_a_capture_equals_the_dense_one():
-    """Exteriors with the interiors that are fixed, but not known, and the mixed covariances."""
+    """Exteriors with fixed but uncertain interior orientations, and mixed covariances."""
     rig, phantom, calibrations = rig_without_distortion()
     frames = frames_of(rig, phantom)
     found = orientation_of_capture(frames, phantom, calibrations, 'lab')
@@ -114,7 +114,7 @@ def test_covariance_of_a_capture_equals_the_dense_one():
 
 
 def test_relative_orientation_of_exposures_equals_the_dense_one():
-    """By finite differences of the weighted mean, enlarged by the scatter of the pairs."""
+    """Reference: finite differences of the weighted mean, enlarged by the scatter of the pairs."""
     rig, phantom, calibrations = rig_without_distortion()
     frames = frames_of(rig, phantom, 4)
     frames['b'] = frames['b'][1:]
@@ -232,7 +232,7 @@ def test_orientation_of_known_fluoroscopes_is_the_mean_of_their_exposures():
 
 
 def still(shifts, sigma=None, ids=((3, 5, 9),) * 9, first=1):
-    """Frames of a phantom that is shifted by (n, 2) [px]; sigma: of each frame."""
+    """Frames of a phantom shifted by (n, 2) [px]; sigma: of each frame."""
     place = np.array([[100.0, 100.0], [500.0, 300.0], [900.0, 700.0]])
     out = []
     for n, shift in enumerate(shifts):
@@ -292,7 +292,7 @@ def test_targets_of_some_frames_have_their_own_weight():
     [(1.2, 0.25, True), (1.3, 0.25, False), (0.95, 0.1, True), (1.05, 0.1, False)],
 )
 def test_false_matches_of_a_capture_are_those_far_from_the_median(off, image_sd, used):
-    """Five standard deviations, but at least a pixel."""
+    """The limit is five standard deviations, but at least a pixel."""
     frames = still([[0.0, 0.0]] * 5)
     uv = frames[2].uv.copy()
     uv[1] += [0.6 * off, -0.8 * off]
@@ -304,7 +304,7 @@ def test_false_matches_of_a_capture_are_those_far_from_the_median(off, image_sd,
 
 
 def test_a_target_of_two_frames_that_contradict_each_other_is_left_out():
-    """Either may be false."""
+    """Either of them may be false."""
     frames = still([[0.0, 0.0], [0.0, 0.0]])
     uv = frames[1].uv.copy()
     uv[1] += [30.0, 0.0]
@@ -313,7 +313,7 @@ def test_a_target_of_two_frames_that_contradict_each_other_is_left_out():
 
 @pytest.mark.parametrize('image_sd, limit', [(0.2, 1.0), (0.5, 2.0)])
 def test_a_phantom_that_moves_is_refused_from_frame_to_frame_and_slowly(image_sd, limit):
-    """Four standard deviations, but at least a pixel."""
+    """The limit is four standard deviations, but at least a pixel."""
     uv = np.random.default_rng(5).uniform(100, 900, (9, 2))
     ids = np.arange(9)
 
@@ -332,14 +332,14 @@ def test_a_phantom_that_moves_is_refused_from_frame_to_frame_and_slowly(image_sd
             else:
                 assert len(of(shifts).uv) == 9
     apart = still([[0.0, 0.0], [50.0, 0.0]], ids=((3,), (5,)))
-    assert mean(apart).target_id.tolist() == [3, 5]  # nothing in common to compare
+    assert mean(apart).target_id.tolist() == [3, 5]  # no common target to compare
 
 
-# ---- pairs that are used
+# ---- selection of pairs
 
 
 def test_many_exposures_are_thinned_evenly():
-    """Exposures that all fluoroscopes have take precedence."""
+    """Exposures seen by all fluoroscopes take precedence."""
     frame = exposures(6)['a'][0]
     frames = {
         name: [replace(frame, fluoroscope=name, number=n) for n in range(*numbers)]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From networks to results: rounds, choice of models, noise of image points, and figures."""
+"""From networks to results: rounds, choice of models, image point noise, and figures."""
 
 from types import SimpleNamespace
 
@@ -68,7 +68,7 @@ def step_of(kind, k=None, seed=1, gauge=GaugeKind.FULL, trend=None):
 
 
 def chosen(step, values, out=()):
-    """Let a step choose; out: rows of outliers."""
+    """Let a step choose k and inliers; out: rows of outliers."""
     q = np.ones(len(values))
     q[list(out)] = 2 * INLIER_Q
     step.choose(values, q, np.tile(np.eye(2), (len(values), 1, 1)))
@@ -80,7 +80,7 @@ def chosen(step, values, out=()):
 
 @pytest.mark.parametrize('kind', [KnnModel, LocalLinearModel])
 def test_noise_of_a_linear_smoother_is_that_of_its_residuals_and_trace(kind):
-    """The smoother matrix, column by column (Hastie et al. 2009, 5.5); bias from held-out."""
+    """The smoother matrix, by columns (Hastie et al. 2009, 5.5); bias from held-out values."""
     step, values = step_of(kind, 25)
     out = np.arange(0, 450, 45)
     values[out] += 90.0
@@ -103,7 +103,7 @@ def test_noise_of_a_linear_smoother_is_that_of_its_residuals_and_trace(kind):
     noise2 = error2 / (1 - 2 * trace + norm2)
     found = step.model(values)
     assert found.noise_px == pytest.approx(np.sqrt(noise2))
-    if kind is KnnModel:  # without a trend, these are those of the whole matrix
+    if kind is KnnModel:  # without a trend, trace and norm equal those of the whole matrix
         assert trace == pytest.approx(np.trace(matrix) / 440)
         assert norm2 == pytest.approx(np.sum(matrix**2) / 440)
     validation = CrossValidation(
@@ -117,7 +117,7 @@ def test_noise_of_a_linear_smoother_is_that_of_its_residuals_and_trace(kind):
 
 
 def test_k_is_looked_for_beyond_that_of_the_last_round():
-    """From few to many neighbours and back, with other inliers in every round."""
+    """From few to many neighbours and back, with different inliers in every round."""
     step, rough = step_of(KnnModel)
     rng = np.random.default_rng(2)
     noisy = rng.normal(0, 3.0, rough.shape)
@@ -202,7 +202,7 @@ def test_no_regression_counts_the_weighted_residuals_of_inliers():
 
 
 class FakeStep:
-    """A regression step that halves values; its figures are given."""
+    """A regression step that halves values and reports given figures."""
 
     iterates = False
 
@@ -291,7 +291,7 @@ def test_correction_of_rounds_is_that_of_their_model_and_estimated_terms(model):
     assert core.sum() > 0.9 * len(core)
 
 
-# ---- a regressor of the user
+# ---- user-defined regressors
 
 
 def user_step(regressor, gauge=GaugeKind.FULL):
@@ -341,17 +341,17 @@ def test_correction_of_a_user_regressor_is_without_gauge(gauge):
     flat = basis[inside].reshape(-1, 6)
     share = np.linalg.lstsq(flat, plain[inside].ravel(), rcond=None)[0]
     np.testing.assert_allclose(fitted, plain - basis @ share, atol=0.02)
-    # The first of two fits is wanted again, with the gauge of its own round.
+    # Request the first of two fits again, with the gauge of its own round.
     step.without_gauge(values, INTERIOR + [100.0, 0, 0])
     step.smooth(values + 1.0)
     np.testing.assert_array_equal(step.model(values).predict(step.points.uv), fitted)
 
 
-# ---- which models are calibrated
+# ---- selection of the calibrated models
 
 
 class FakeJobs:
-    """Runs of models instead of calibrations."""
+    """Stand-in that records model runs instead of calibrating."""
 
     def __init__(self, monkeypatch, better=None):
         self.made = []
@@ -424,7 +424,7 @@ def test_estimators_are_those_of_selectable_models():
 
 
 def grouped(monkeypatch, misfits, exposures=6):
-    """Frames with which each repeat of a calibration was made, and the run."""
+    """The frames used in each repetition of a calibration, and the function that runs it."""
     made = []
     frames = {
         'a': [SimpleNamespace(number=n) for n in range(exposures)],
@@ -489,7 +489,7 @@ def noise_of(loss, nu, between=None):
 
 @pytest.mark.parametrize('loss, nu', [('student_t', 8.0), ('student_t', 120.0), ('gaussian', 5.0)])
 def test_noise_of_image_points_is_that_of_residuals_over_their_redundancy(loss, nu):
-    """With heavy tails, the redundancy is that of the geometry."""
+    """With heavy tails, the redundancy is the geometric one."""
     found, run, rows = noise_of(loss, nu)
     square = np.mean(run.after.residuals[rows] ** 2, axis=1)
     if nu == 8.0:
@@ -578,7 +578,7 @@ def test_an_adjustment_with_starts_has_no_residuals_without_correction():
     np.testing.assert_allclose(one.rmse_after, other.rmse_after, rtol=1e-4)
     for a, b in zip(one.exposures, other.exposures):
         np.testing.assert_allclose(a.position_mm, b.position_mm, atol=0.05)
-        assert (b.sd_mm < a.sd_mm).all()  # without the uncertainty of the interior orientation
+        assert (b.sd_mm < a.sd_mm).all()  # excludes the uncertainty of the interior
     sd = np.sqrt(np.diagonal(calibrations['a'].interior_covariance))
     np.testing.assert_allclose(one.interior_sd, sd, rtol=0.05)
     assert not other.interior_sd.any()
@@ -602,7 +602,7 @@ def test_options_that_exclude_each_other_are_refused():
 
 
 def test_findings_of_all_groups_are_in_the_result():
-    """Those of separate adjustments, too: exposures that are excluded."""
+    """So are those of separate adjustments, such as excluded exposures."""
     frames = {name: list(of_one[:5]) for name, of_one in rigs.exposures().items()}
     for name, n in (('a', 1), ('b', 3)):
         small = frames[name][n].rows(np.arange(len(frames[name][n].uv)) < 11)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The survey of a phantom from its own exposures: recovered coordinates, claims and refusals."""
+"""Survey of a phantom from its own exposures: recovered coordinates, claims and refusals."""
 
 import functools
 import json
@@ -40,15 +40,15 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation import rig as simulated
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
-GROWN = 1.003  # the phantom in hand over its drawing
+GROWN = 1.003  # size of the actual phantom relative to its drawing
 ENDS = ((1, 130), (20, 300), (260, 480))
 CALIPER_MM = 0.02
-# Seed, exposures and standard deviation of a drawing that the image points do not fit [mm].
+# Seed, number of exposures and drawing error [mm] at which the image points do not fit.
 OF_ROUGH = (2, 12, 15.0)
 
 
 def rough(rig, sd_mm=1.0, seed=5):
-    """Coordinates of a drawing with errors, of a phantom that has grown since."""
+    """Coordinates of a drawing with errors, while the phantom itself has grown since."""
     noise = np.random.default_rng(seed).normal(0, sd_mm, rig.true_mm.shape)
     return Phantom(rig.phantom.target_id, rig.true_mm / GROWN + noise, np.full(len(noise), sd_mm))
 
@@ -72,7 +72,7 @@ def measured(rig, ends=ENDS, seed=6):
 
 
 def errors(beads, rig):
-    """Errors (n, 3) [mm] after a rigid motion, with which the datum has nothing to do."""
+    """Errors (n, 3) [mm] after a best-fit rigid motion, which removes the datum."""
     return compared(beads, rig)[0]
 
 
@@ -96,7 +96,7 @@ def nse(beads, rig):
 
 
 def of_one_fluoroscope(seed, exposures, sd_mm):
-    """Rig of one fluoroscope and a request with distances between beads that are often seen."""
+    """Rig of one fluoroscope, and a request with distances between frequently seen beads."""
     rig = grown_rig(seed, names=('a',))
     frames = simulated.simulate_exposures(rig, exposures, seed).frames
     seen = np.bincount(np.concatenate([frame.target_id for frame in frames['a']]))
@@ -107,7 +107,7 @@ def of_one_fluoroscope(seed, exposures, sd_mm):
 
 @functools.cache
 def surveyed_by_one(seed, exposures, sd_mm):
-    """Rig, request and outcome of one fluoroscope; beads that are not surveyed are kept."""
+    """Rig, request and outcome for one fluoroscope; beads that are not surveyed are kept."""
     rig, request = of_one_fluoroscope(seed, exposures, sd_mm)
     return rig, request, survey(replace(request, keep_given=True))
 
@@ -138,7 +138,7 @@ def test_distances_equal_a_dense_adjustment_with_unknown_scale():
     found = scaled_by_distances(
         xyz, blocks[np.arange(n), np.arange(n)], lambda p, q: blocks[p, q], given, centre
     )
-    # Unknowns: errors of the points, with their prior, and the scale.
+    # The unknowns are the errors of the points, with their prior, and the scale.
     a = np.zeros((4, 3 * n + 1))
     for row, (i, j) in enumerate(pairs):
         a[row, 3 * i : 3 * i + 3] = -offset[row] / length[row]
@@ -210,7 +210,7 @@ def free_network(in_datum=None):
 
 @pytest.mark.parametrize('some', [False, True])
 def test_beads_without_a_distance_have_the_scale_of_their_given_coordinates(some):
-    """As uncertain as these are, about the centre of the datum."""
+    """The scale is as uncertain as these coordinates, about the centre of the datum."""
     in_datum = np.arange(9) < 6 if some else None
     result, given, _ = free_network(in_datum)
     found = surveyed_beads(result, given)
@@ -266,7 +266,7 @@ def test_beads_with_distances_have_their_scale():
 
 
 def test_errors_of_distances_are_those_that_all_others_show():
-    """Baarda's test: the error of one; a distance that nothing checks shows none."""
+    """Baarda's test finds a single error; a distance without a check shows none."""
     result, _, blocks = free_network()
     xyz = result.targets.xyz_mm
     pairs = np.array([(0, 7), (8, 2), (4, 1), (3, 6)])
@@ -277,7 +277,7 @@ def test_errors_of_distances_are_those_that_all_others_show():
     given = Distances(pairs, wrong, np.full(4, 0.02))
     found = scaled_by_distances(xyz, own, lambda p, q: tiny[p, q], given, xyz.mean(axis=0))
     assert found.error_mm[1] == pytest.approx(0.8, rel=1e-4)
-    # The residual of an error over its standard deviation.
+    # The residual caused by the error, over its standard deviation.
     redundancy = 1 - length[1] ** 2 / np.sum(length**2)
     assert found.normalised[1] == pytest.approx(0.8 * np.sqrt(redundancy) / 0.02, rel=1e-4)
     assert np.abs(found.normalised).argmax() == 1
@@ -296,7 +296,7 @@ def test_a_perturbed_phantom_is_recovered_within_its_claims():
     assert beads.scale_sd < 5e-4
     assert np.sqrt(np.mean(errors(beads, rig) ** 2)) < 0.1
     assert outcome.phantom.sd_mm == pytest.approx(beads.sd_mm, abs=1e-6)
-    # The frame is that of the given coordinates.
+    # The frame stays that of the given coordinates.
     assert np.abs(np.mean(beads.xyz_mm - beads.given_mm, axis=0)).max() < 0.02
 
 
@@ -310,7 +310,7 @@ def test_a_wrong_distance_is_found_with_its_error():
     assert check.passed is False
     assert check.place.target_id == ENDS[2]
     assert check.numbers['error_mm'] == pytest.approx(1.0, abs=0.2)
-    # Of two, either may be wrong.
+    # With only two distances, either may be wrong.
     check = checked(surveyed_beads(outcome.result, given, [distances[0], wrong]), Kind.DISTANCES)
     assert check.passed is False
     assert check.place.target_id == (*ENDS[0], *ENDS[2])
@@ -343,7 +343,7 @@ def test_halves_that_differ_by_more_than_they_claim_are_found():
     assert good.passed and good.value == pytest.approx(1.0, abs=0.15)
     face = (beads.given_mm[:, 0] > 100)[:, None]
     turned = replace(other, xyz_mm=1.01 * other.xyz_mm @ matrix_from_vector([0, 0, 0.02]).T + 3)
-    assert check_survey_halves(one, turned).passed  # the datum is not compared
+    assert check_survey_halves(one, turned).passed  # the datum has no influence
     moved = replace(other, xyz_mm=other.xyz_mm + face * [0.5, 0, 0])
     assert check_survey_halves(one, moved).passed is False
 
@@ -416,7 +416,7 @@ def test_poses_that_do_not_separate_the_unknowns_are_refused(monkeypatch, degree
 
 @pytest.mark.long
 def test_a_bead_with_one_good_ray_does_not_spoil_the_datum_of_a_free_network():
-    """Its place along the ray is open; all other beads had that in their sd: 2 mm of 0.06 mm."""
+    """Its place along the ray is open; this raised the sd of all others from 0.06 to 2 mm."""
     rig = rigs.rig()
     frames = rigs.exposures(8)['a']
     seen = np.concatenate([f.target_id for f in frames])
@@ -449,7 +449,7 @@ def test_the_command_writes_the_phantom_unless_it_fails(tmp_path, capsys, monkey
     checks = outcome.validation.checks
 
     def surveyed_again(request, progress):
-        """The survey of these exposures, with other distances."""
+        """The survey of the same exposures with other distances."""
         requests.append(request)
         beads = surveyed_beads(outcome.result, request.given, request.distances)
         checked_again = (*check_survey(beads), checks[-1])
@@ -480,7 +480,7 @@ def test_the_command_writes_the_phantom_unless_it_fails(tmp_path, capsys, monkey
 
 @pytest.mark.long
 def test_rough_coordinates_and_kept_ones():
-    """To 15 mm, where the image points do not fit the phantom; unsurveyed beads keep theirs."""
+    """Errors of 15 mm do not fit the image points; unsurveyed beads keep their coordinates."""
     rig, request, outcome = surveyed_by_one(*OF_ROUGH)
     given = request.given
     with rigs.refused(Kind.OTHER_PHANTOM):
@@ -509,7 +509,7 @@ def test_claims_of_beads_and_scale_hold_over_seeds():
 
 @pytest.mark.long
 def test_a_calibration_with_the_survey_is_nearly_as_good_as_with_the_truth():
-    """Out of sample: other exposures, adjusted with the true phantom."""
+    """Out of sample: other exposures are adjusted with the true phantom."""
     rig, _, outcome = surveyed()
     one = {'fluoroscopes': rig.fluoroscopes[:1]}
     others = simulated.simulate_exposures(replace(rig, **one), 8, 7).frames
@@ -533,6 +533,6 @@ def test_a_calibration_with_the_survey_is_nearly_as_good_as_with_the_truth():
 
 
 def without_targets(frame, phantom):
-    """Return a frame without targets that a phantom does not have."""
+    """Return a frame without the targets that a phantom does not contain."""
     known = phantom.index(frame.target_id) >= 0
     return replace(frame, target_id=frame.target_id[known], uv=frame.uv[known])

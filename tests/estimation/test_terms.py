@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Terms of a distortion in the adjustment: their equations, changes, refinements and series."""
+"""Terms of a distortion in the adjustment: equations, changes, refinements and series."""
 
 from dataclasses import replace
 from functools import cache
@@ -65,14 +65,14 @@ def case(modes=6, fluoroscopes=1, exposures=6, targets=50, **options):
 
 
 def with_own(terms, size_px=0.5):
-    """Give the fluoroscopes terms of their exposures."""
+    """Give each fluoroscope terms of its exposures."""
     for part in terms.parts:
         functions = exposure_functions(part.uv, SIZE, part.interior)
         part.own = ExposureTerms(functions, part.exposure, size_px)
 
 
 def solved(network, before, terms):
-    """Network with the terms, its adjustment and factorized normal matrix."""
+    """Network with the terms, its adjustment and its factorized normal matrix."""
     varying = terms.with_additional(network)
     parameters = replace(before.parameters, additional=terms.zeros())
     after = adjust(varying, parameters, noise=NOISE)
@@ -103,10 +103,10 @@ def test_rows_of_the_gauge_give_its_part_of_a_series(kind):
 
 
 def test_gauge_of_a_cubic_trend_is_that_of_the_best_cubic_polynomial():
-    """Affinity and decentring are no part of it, though they are not orthogonal to it."""
+    """Affinity and decentring are not part of the gauge, though not orthogonal to it."""
     rng = np.random.default_rng(2)
     interior = np.array([480.0, 530.0, 2000.0])
-    uv = rng.uniform(0, 700, (400, 2))  # not about the principal point
+    uv = rng.uniform(0, 700, (400, 2))  # not centred on the principal point
     x, y = (uv - interior[:2]).T / 512
     brown = np.stack([x * (x * x + y * y) + 3 * x * x + y * y, y * (x * x + y * y) + 2 * x * y], 1)
     affine = np.stack([x + 0.3 * y, -y + 0.3 * x], axis=1)
@@ -118,7 +118,7 @@ def test_gauge_of_a_cubic_trend_is_that_of_the_best_cubic_polynomial():
 
 
 def test_no_orientation_is_about_another_point_where_image_points_come_to_lie_behind():
-    """Corrections that mirror the image."""
+    """The corrections mirror the image."""
     axis = np.linspace(0, 1023, 8)
     uv = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     interior = np.array([511.5, 511.5, 1000.0])
@@ -136,7 +136,7 @@ def test_image_points_of_a_single_exposure_are_dealt_out():
 
 @pytest.mark.parametrize('own', [False, True])
 def test_equations_of_a_series_are_those_of_all_unknowns_without_its_prior(own):
-    """Solved with another prior, they give what the adjustment with that prior does."""
+    """Solving them with another prior gives the result of the adjustment with that prior."""
     network, before, terms = case(modes=4, fluoroscopes=2)
     if own:
         with_own(terms)
@@ -231,7 +231,7 @@ def test_series_of_terms_is_without_those_of_exposures_and_with_its_uncertain_te
     found = terms.fitted_series(0, after, precise)
     uv = part.uv[:40]
     field = part.functions(uv) @ coefficients[:end].reshape(2, -1).T
-    # Rings that do not exist are left out.
+    # Rings that do not exist are excluded.
     np.testing.assert_allclose(found.predict(uv), field, atol=1e-3)
     assert found.functions.degree == 3
     covariance = covariance_of_series(
@@ -343,7 +343,7 @@ def test_a_change_of_the_terms_continues_with_the_same_correction():
 
 
 def test_terms_of_exposures_stay_where_the_series_is_given_anew():
-    """Rejected image points that agree may be found after exposures that differ."""
+    """Agreeing rejected image points may be found after terms of exposures were added."""
     network, before, terms = case(modes=5)
     part = terms.parts[0]
     functions = exposure_functions(part.uv, SIZE, part.interior)
@@ -372,7 +372,7 @@ def test_priors_stay_after_two_renewals_that_change_nothing():
     assert settled[-3:] == [True] * 3 and not settled[0]
     first = settled.index(True)
     assert all(settled[first:])
-    assert terms.priors[0] is last  # not renewed any more
+    assert terms.priors[0] is last  # the prior is not updated any more
 
 
 def test_terms_of_an_earlier_calibration_start_with_its_series():
@@ -412,7 +412,7 @@ def plane_wave(uv, wavelength):
 
 
 def solution_with(terms, network, before, residuals, coefficients=None):
-    """A steady solution with these residuals (N, 2) and coefficients."""
+    """A steady solution with given residuals (N, 2) and coefficients."""
     additional = coefficients or terms.zeros()
     q = np.sum(residuals**2, axis=1) / (0.3 * network.sigma) ** 2
     after = replace(
@@ -425,7 +425,7 @@ def solution_with(terms, network, before, residuals, coefficients=None):
 
 
 def many_points(modes):
-    """Terms of a network of many image points."""
+    """Terms of a network with many image points."""
     network, truth = rigs.small_network(12, 160, seen=0.9, seed=2)
     network = replace(network, sigma=np.ones(len(network.uv)))
     before = adjust(network, truth, noise=NOISE)
@@ -445,7 +445,7 @@ def test_ripples_of_residuals_are_proposed_beside_the_complete_sines():
 
 
 def test_ripples_that_sines_have_followed_are_proposed_in_their_place():
-    """The sines beyond those of a smooth field are left out, and its short part starts anew."""
+    """Sines beyond those of a smooth field are removed; its short part starts anew."""
     network, before, terms = many_points(28)
     part = terms.parts[0]
     rng = np.random.default_rng(9)
@@ -483,7 +483,7 @@ def test_a_place_that_residuals_show_is_proposed_with_its_sines():
     noise = np.random.default_rng(10).normal(0, 0.1, network.uv.shape)
     assert places(solution_with(terms, network, before, noise)) is None
     middle = np.median(network.uv, axis=0)
-    # A part of the dent is in the correction already.
+    # The correction already contains a part of the dent.
     values = part.functions(part.uv)
     whole = dent(network.uv, middle, (0.9, -0.6))
     followed = np.linalg.lstsq(values, whole, rcond=1e-6)[0].T
@@ -530,7 +530,7 @@ def test_places_are_looked_for_with_the_weights_of_the_adjustment(monkeypatch):
 
 @cache
 def rejected_dent(far=False):
-    """Terms, and a solution that has rejected the image points of a dent."""
+    """Terms, and a solution that rejects the image points of a dent."""
     network, before, terms = many_points(12)
     middle = np.median(network.uv, axis=0)
     residuals = np.random.default_rng(11).normal(0, 0.1, network.uv.shape)
@@ -558,7 +558,7 @@ def test_rejected_points_that_agree_are_followed_once():
 
 
 def test_rejected_points_far_beyond_any_correction_are_no_error_of_it():
-    """Forty standard deviations."""
+    """They are off by forty standard deviations."""
     _, _, there = rejected_dent(far=True)
     assert AgreeingOutliers().propose(there) is None
 
@@ -582,7 +582,7 @@ def test_what_is_followed_is_the_posterior_with_the_proposed_prior():
 
 
 def test_terms_of_exposures_that_follow_an_angle_have_those_of_the_interior():
-    """At most as many modes as at the start; not of too many exposures."""
+    """Modes do not exceed the initial number; too many exposures get no terms."""
     rng = np.random.default_rng(12)
     exposures = 8
     uv = rng.uniform(0, 1024, (100 * exposures, 2))
@@ -615,7 +615,7 @@ def test_terms_of_exposures_that_follow_an_angle_have_those_of_the_interior():
     assert proposed(np.zeros(0), 40, np.arange(len(uv)) // 13) is None
 
 
-# ---- terms of the expert
+# ---- expert terms
 
 
 def bent(network, field):
@@ -694,7 +694,7 @@ def test_terms_that_were_not_estimated_have_no_series():
 
 
 def expert_step(network, before, selected):
-    """Terms, with some selected, and what a step sees of their solution."""
+    """Terms with a selection, and the inputs of a step at their solution."""
     terms = StepwiseTerms(problem_of(network, before))
     terms.selected[0][selected] = True
     varying, after, matrix = solved(network, before, terms)
@@ -716,7 +716,7 @@ def test_a_term_that_is_not_significant_is_rejected_for_good():
 
 
 def test_the_term_with_the_largest_statistic_is_added():
-    """That with which the likelihood grows most once it is estimated with those selected."""
+    """That term raises the likelihood most once it is estimated with those selected."""
     network, truth = rigs.small_network(8, 70, noise_px=0.2)
     network = replace(bent(network, radial_and_spiral), sigma=np.ones(len(network.uv)))
     before = adjust(network, truth, noise=NOISE)
@@ -730,7 +730,7 @@ def test_the_term_with_the_largest_statistic_is_added():
 
 
 def test_change_by_a_term_is_that_of_the_adjustment_with_it(monkeypatch):
-    """The selected terms and all other unknowns follow."""
+    """The selected terms and all other unknowns adapt to it."""
     network, truth = rigs.small_network(8, 70, noise_px=0.2)
     network = replace(bent(network, radial_and_spiral), sigma=np.ones(len(network.uv)))
     before = adjust(network, truth, noise=NOISE)
@@ -782,6 +782,6 @@ def test_a_significant_term_stays_if_it_reduces_the_rmse_or_the_trend():
     after = replace(before, residuals=wave + noise)
     square = np.sum(after.q[after.inliers])
     small, large = (np.sqrt(square * (1 - (1 - part) ** 2)) for part in (0.9e-3, 1.1e-3))
-    assert terms._improves(0, after, rows, wave, small)  # the trend
+    assert terms._improves(0, after, rows, wave, small)  # reduces the trend
     assert not terms._improves(0, after, rows, -wave, small)
-    assert terms._improves(0, after, rows, -wave, large)  # the RMSE
+    assert terms._improves(0, after, rows, -wave, large)  # reduces the RMSE

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Standard deviations contain that it is uncertain which terms of a trend exist."""
+"""Standard deviations include the uncertainty as to which terms of a trend exist."""
 
 import numpy as np
 import pytest
@@ -14,12 +14,12 @@ from fluoro_calib_ros.estimation.parametric import (
 
 
 def most_likely_kept(ratio):
-    """Part of an estimate that is kept with the prior variance of the largest likelihood."""
+    """Kept fraction of an estimate, with the prior variance of the largest likelihood."""
     return np.maximum(1 - 1 / np.maximum(ratio**2, 1e-9), 1e-3)
 
 
 def by_definition(ratio, kept):
-    """Squared error about what is kept, by adaptive quadrature over the prior."""
+    """Expected squared error of the kept fraction, by adaptive quadrature over the prior."""
 
     def likelihood(k):
         return np.sqrt(k) * np.exp(-k * ratio**2 / 2)

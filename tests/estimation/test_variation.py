@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Distortion that differs between exposures, and what a model cannot follow."""
+"""Distortion that differs between exposures, and distortion that a model cannot follow."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ NOISE = 0.25
 
 
 def image_points(seed=0, count=100):
-    """Pixels (n, 2) of some exposures, and their exposures (n,)."""
+    """Pixels (n, 2) in several exposures, and their exposure numbers (n,)."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(0, 1, (EXPOSURES * count, 2)) * SIZE
     return uv, np.repeat(np.arange(EXPOSURES), count), rng
@@ -55,7 +55,7 @@ def test_variation_is_found_with_its_size(size_px):
     coefficients = rng.normal(0, size_px / np.sqrt(14), (EXPOSURES, 14))
     r = np.einsum('nak,nk->na', functions, coefficients[exposure])
     found = variation(r + rng.normal(0, 0.8 * NOISE, r.shape), exposure, functions)
-    # Independent residuals have 1; those of an adjustment less, which the limit is for.
+    # Independent residuals give 1; those of an adjustment give less, which the limit is made for.
     assert found.chi2_per_dof > 1.5 * VARYING if size_px else found.chi2_per_dof < 1.25
     assert found.size_px == pytest.approx(np.sqrt(np.mean(r**2)), rel=0.25, abs=0.03)
 
@@ -97,7 +97,7 @@ def test_what_is_not_known_of_a_change_of_the_interior_is_as_large_as_other_term
     true = np.full(17, 0.2)
     true[16] = 0.05
     mean = rng.normal(0, 1, (EXPOSURES, 17)) * true
-    mean[:, 14] = 0  # not determined: the posterior is the prior
+    mean[:, 14] = 0  # undetermined: the posterior equals the prior
     for _ in range(40):
         posterior = np.full((EXPOSURES, 17), 0.01**2)
         posterior[:, 14] = terms.variance[14]
@@ -110,7 +110,7 @@ def test_what_is_not_known_of_a_change_of_the_interior_is_as_large_as_other_term
 
 
 def test_what_a_series_cannot_follow_is_part_of_its_standard_deviation():
-    """A dent in one place, and nothing where residuals are noise."""
+    """A dent is shown in one place; where residuals are noise, nothing is added."""
     uv, exposure, rng = image_points(3, 200)
     functions = Functions(SIZE, 1)
     series = Series(functions, np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
@@ -146,11 +146,11 @@ def test_residuals_bound_the_variance_beyond_a_series():
     rippled = FittedPoints(uv, noise + ripples, exposure)
     shown = np.median(sd_with_lack_of_fit(rippled, series, smooth(1.0)))
     assert 0.5 * 0.14 < shown < 1.5 * 0.14
-    # Also ripples that change much from one point to the next.
+    # The same for ripples that change strongly from one point to the next.
     waves = 0.3 * np.sin(uv / 7)
     found = np.median(sd_with_lack_of_fit(FittedPoints(uv, noise + waves, exposure), series))
     assert 0.7 * 0.21 < found < 1.4 * 0.21
-    # Ripples too short for the distance of the points cannot be excluded.
+    # Ripples that are too short for the point spacing cannot be excluded.
     short = LeftOut(0.5, np.zeros_like)
     assert np.median(sd_with_lack_of_fit(points, series, short)) == pytest.approx(0.5)
 
@@ -158,18 +158,18 @@ def test_residuals_bound_the_variance_beyond_a_series():
 def test_products_of_neighbours_are_extrapolated_to_no_distance():
     distance = np.random.default_rng(7).uniform(10, 40, (50, 5))
     distance[:, -1] = 1e3
-    near = np.arange(5) < 4  # the last are of the same exposure
+    near = np.arange(5) < 4  # the last neighbour belongs to the same exposure
     other = np.broadcast_to(near, distance.shape)
     product = np.where(other, 1 - (distance / 100) ** 2, -50.0)
     expected = 1 / product[other].mean()
     assert _growth(product, distance, other) == pytest.approx(expected)
     assert _growth(-product, distance, other) == 1.0
-    assert _growth(0.94 - product, distance, other) == 1.0  # it grows with the distance
+    assert _growth(0.94 - product, distance, other) == 1.0  # the product grows with the distance
     assert _growth(product, np.full_like(distance, 20.0), other) == 1.0
 
 
 def test_correlation_of_what_a_series_leaves_out():
-    """It is that of random waves which the covariance function expects."""
+    """It equals that of the random waves which the covariance function expects."""
     signal = Signal(0.5, 100.0, 0.2, 30.0)
     distance = np.array([0.0, 10.0, 30.0, 80.0])
     found = signal.correlation_beyond(0.05, distance)
@@ -181,7 +181,7 @@ def test_correlation_of_what_a_series_leaves_out():
 
 
 def test_rejected_points_that_agree_are_an_error_of_the_correction():
-    """Those of a dent are, false matches are not."""
+    """Points of a dent are such an error, false matches are not."""
     uv, exposure, rng = image_points(5, 200)
     series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
     inliers = FittedPoints(uv, rng.normal(0, NOISE, uv.shape), exposure)
@@ -189,7 +189,7 @@ def test_rejected_points_that_agree_are_an_error_of_the_correction():
     wrong = rng.normal(0, 20.0, (len(false), 2))
     nothing = sd_of_rejected(inliers, FittedPoints(uv[false], wrong, exposure[false]), series)
     assert (nothing > 0).mean() < 0.02
-    # Many of so small ones agree by chance.
+    # Many residuals of this size agree by chance, so they show no error.
     small = wrong / np.linalg.norm(wrong, axis=1)[:, None] * 5 * NOISE
     nothing = sd_of_rejected(inliers, FittedPoints(uv[false], small, exposure[false]), series)
     assert not nothing.any()
@@ -203,13 +203,13 @@ def test_rejected_points_that_agree_are_an_error_of_the_correction():
     column = round(600 / SIZE[0] * (SD_GRID - 1))
     assert 1.0 < found[row, column] < 2.0
     assert (found > 0).mean() < 0.05
-    # With as many inliers beside them, they are half of the variance there.
+    # With as many inliers next to them, they make up half of the variance there.
     half = sd_of_rejected(inliers, rejected, series)
     assert half[row, column] == pytest.approx(found[row, column] / np.sqrt(2), rel=0.1)
 
 
 def test_rejected_points_at_a_rim_that_one_exposure_shows_are_an_error_of_the_correction():
-    """Nothing contradicts them there; where other exposures have inliers, they do."""
+    """No other exposure contradicts them there, unless it has inliers at the rim."""
     uv, exposure, rng = image_points(5, 200)
     series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
     residuals = rng.normal(0, NOISE, uv.shape)

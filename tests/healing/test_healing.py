@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What has changed in a rig, by the bodies that it sees; views are made without the package."""
+"""What has changed in a rig, inferred from visible bodies; views are made without the package."""
 
 from dataclasses import replace
 from types import SimpleNamespace as Fake
@@ -32,12 +32,12 @@ EXPOSURES = 12
 BODIES = 3
 MARKERS = 5
 SIZE = (1024, 1024)
-# What a healthy rig does not know of itself: T [mm], w [rad], xp, yp, c [px].
+# Standard deviations of a healthy rig: T [mm], w [rad], xp, yp, c [px].
 RIG_SD = np.array([0.02] * 3 + [2e-5] * 3 + [0.1, 0.1, 0.3])
 
 
 class Scene:
-    """Bodies that move through a rig, some of whose errors have changed."""
+    """Bodies moving through a rig whose parameters may have changed."""
 
     def __init__(self, seed):
         self.rng = rng = np.random.default_rng(seed)
@@ -59,7 +59,7 @@ class Scene:
         )
 
     def observe(self, changed=np.zeros(18), scatter_mm=()):
-        """Image points of the rig with changes (18,); bodies whose markers scatter [mm]."""
+        """Image points of the rig with changes (18,). scatter_mm: bodies whose markers scatter."""
         points = self.shapes @ np.swapaxes(self.rotation, 2, 3) + self.centre[:, :, None]
         for body, markers, sd in scatter_mm:
             points[:, body, markers] += self.rng.normal(0, sd, points[:, body, markers].shape)
@@ -73,7 +73,7 @@ class Scene:
         return ObservedBodies(uv, uv, variance, correction, np.ones(uv.shape[:4], bool))
 
     def poses(self):
-        """First poses, off by a millimetre and a degree."""
+        """Initial poses, off by a millimetre and a degree."""
         turn = Rotation.from_rotvec(self.rng.normal(0, 0.02, (EXPOSURES * BODIES, 3))).as_matrix()
         return Poses(
             turn.reshape(self.rotation.shape) @ self.rotation,
@@ -94,7 +94,7 @@ def test_derivatives_are_those_of_differences():
     poses = scene.poses()
     rng = np.random.default_rng(2)
     values = rng.normal(0, 1e-3, adjustment.size)
-    values[adjustment.drift] = 0.0  # the gradient of a drift is neglected beside 1
+    values[adjustment.drift] = 0.0  # the gradient of a drift is neglected relative to 1
 
     def residual(at, of=poses):
         return LinearPoints.of(adjustment, observed, at, of).residual
@@ -121,7 +121,7 @@ def test_derivatives_are_those_of_differences():
 
 
 def test_inliers_are_told_from_false_matches_that_lie_anywhere():
-    """One of a hundred, with the density of the image area."""
+    """One point of a hundred is false, with the density of the image area."""
     residual = np.array([[0.1, 0.2], [0.8, -0.3], [1.5, 1.0]])[None, None, :, None]
     variance = np.array([0.04, 0.09, 0.16])[None, None, :, None]
     scale = np.array([[[1.0, 2.0, 1.0]]])
@@ -136,7 +136,7 @@ def test_inliers_are_told_from_false_matches_that_lie_anywhere():
     square = np.sum(residual**2, axis=-1) / of_noise
     density = 0.99 * np.exp(-square / 2) / (2 * np.pi * of_noise)
     np.testing.assert_allclose(found.inlier(), density / (density + 0.01 / area))
-    # The likelihood, less that of a residual of 0 without the scale.
+    # The likelihood relative to that of a zero residual without the scale.
     likelihood = (density + 0.01 / area) * 2 * np.pi * variance / 0.99
     np.testing.assert_allclose(found.losses, -2 * np.log(likelihood))
 
@@ -154,7 +154,7 @@ def test_errors_of_points_are_of_their_scale_of_each_and_of_all_together():
 
 
 def test_error_of_a_correction_counts_once():
-    """What stays of each marker and what differs have together the variance that is claimed."""
+    """The constant part of each marker and the smooth part sum to the claimed variance."""
     scene = Scene(3)
     adjustment = scene.diagnostician().adjustment
     observed = scene.observe()
@@ -203,7 +203,7 @@ def test_knock_would_be_told_by_bodies_that_move_and_not_by_a_single_one_that_st
 
 
 def test_unseen_knock_is_claimed_by_the_evidence_of_its_size():
-    """Less than if the rig had certainly been knocked hard, more than as it was calibrated."""
+    """The claim is smaller than after a certain hard knock, and larger than as calibrated."""
     scene = Scene(3)
     diagnostician = scene.diagnostician()
     found = diagnostician.diagnose(scene.observe(), scene.poses())
@@ -224,7 +224,7 @@ def test_unseen_knock_is_claimed_by_the_evidence_of_its_size():
 
 @pytest.mark.long
 def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
-    """Over rigs: the change of b is what was done to it, as its covariance claims."""
+    """Over several rigs, the change of b is estimated as well as its covariance claims."""
     squares = []
     for seed in range(4, 7):
         scene = Scene(seed)
@@ -242,17 +242,17 @@ def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
         error = (healed.changes[1] - moved[9:] - scene.errors[9:])[:6]
         covariance = healed.orientation.covariance[9:15, 9:15]
         squares.append(error @ np.linalg.solve(covariance, error))
-        # The fixed unknowns keep the covariance that they had.
+        # The fixed unknowns keep their covariance.
         np.testing.assert_allclose(
             healed.orientation.covariance[15:, 15:], scene.covariance[15:, 15:], rtol=1e-6
         )
-    # chi-square with 18 degrees of freedom: 0.5 % are beyond each limit
+    # chi-square with 18 degrees of freedom: 0.5 % lie beyond each limit
     assert 6.3 < np.sum(squares) < 37.2
 
 
 @pytest.mark.long
 def test_estimate_does_not_depend_on_the_size_that_was_likeliest():
-    """Of bodies that stand still, which tell little of some directions of the change."""
+    """The bodies stand still, so some directions of the change are hardly determined."""
     scene = Scene(8)
     scene.rotation = np.repeat(scene.rotation[:1], EXPOSURES, axis=0)
     scene.centre = np.repeat(scene.centre[:1], EXPOSURES, axis=0)
@@ -279,7 +279,7 @@ def test_estimate_does_not_depend_on_the_size_that_was_likeliest():
 @pytest.mark.long
 @pytest.mark.parametrize('cause', [Cause.ORIENTATION, Cause.INTERIOR])
 def test_evidence_of_a_cause_is_the_mean_over_its_sizes(cause):
-    """Of solutions with every second size of each part, as equations hold near one of them."""
+    """Reference: solutions for every second size, as equations are valid only near one."""
     scene = Scene(9)
     moved = np.zeros(18)
     moved[9:15] = [0.4, -0.3, 0.2, 0.0006, -0.0004, 0.0005]
@@ -303,7 +303,7 @@ def test_evidence_of_a_cause_is_the_mean_over_its_sizes(cause):
             total += of_a * of_b * np.exp(one.evidence - found.solution.evidence)
     expected = found.solution.evidence + np.log(total / weights.sum() ** 2)
     assert found.evidence == pytest.approx(expected, abs=0.5)
-    # The size that is solved with is another one than the mean.
+    # The size used in the solution differs from the mean.
     assert abs(found.by_size) > 0.5
 
 
@@ -368,7 +368,7 @@ def test_no_further_cause_is_looked_for_after_one_that_is_enough():
 
 
 def test_hypothesis_that_turns_the_rig_into_another_one_ends_before():
-    """Images of b at a third of their size, as of a principal distance that cannot be."""
+    """Images of b have a third of their size, as if by an impossible principal distance."""
     scene = Scene(51)
     diagnostician = scene.diagnostician()
     adjustment = diagnostician.adjustment
@@ -385,14 +385,14 @@ def test_hypothesis_that_turns_the_rig_into_another_one_ends_before():
 
 
 def test_pose_with_two_false_matches_does_not_take_others_for_false():
-    """From a start that fits none, and of a body whose two other markers are seen by one view."""
+    """The start fits no marker, and two other markers of the body are seen by one view only."""
     scene = Scene(50)
     adjustment = scene.diagnostician().adjustment
     observed = scene.observe()
     uv = observed.uv.copy()
     uv[5, 1, [0, 3], 1] = [[200.0, 700.0], [800.0, 300.0]]
     seen = observed.seen.copy()
-    seen[5, 1, 4] = False  # a body of four
+    seen[5, 1, 4] = False  # leaves a body of four markers
     observed = replace(observed, uv=uv, pixel=uv, seen=seen)
     prior = adjustment.healthy_prior(observed, 1e-4)
     right = adjustment.solve(observed, prior, (np.zeros(adjustment.size), scene.poses()))
@@ -418,7 +418,7 @@ def test_false_matches_are_tried_alone_and_in_pairs_of_bodies_with_few_image_poi
 
 @pytest.mark.long
 def test_errors_of_points_by_the_rig_are_those_of_random_rigs():
-    """Scale and places of points that random errors of the rig move, by a Monte Carlo run."""
+    """Scale and places of points after random errors of the rig, by Monte Carlo."""
     scene = Scene(40)
     covariance = np.diag(np.tile(RIG_SD, 2) ** 2)
     rig = replace(scene.rig, covariance=covariance)

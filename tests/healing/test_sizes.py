@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How large a change is, by what the data tell of it."""
+"""Size of a change, estimated from the data."""
 
 import numpy as np
 import pytest
@@ -11,13 +11,13 @@ from fluoro_calib_ros.healing.sizes import SIZES, Told
 
 
 def told_of(change, design, noise, rng):
-    """What observations tell that have derivatives design (n, k) by a change (k,)."""
+    """Information on a change (k,) from observations with derivatives design (n, k)."""
     observed = design @ change + rng.normal(0, noise, len(design))
     return Told(design.T @ design / noise**2, design.T @ observed / noise**2), observed
 
 
 def test_evidence_is_the_density_of_the_observations():
-    """Against that of no change, by scipy's normal distribution."""
+    """Relative to the density without a change, by scipy's normal distribution."""
     rng = np.random.default_rng(1)
     design = rng.normal(size=(12, 3))
     told, observed = told_of(np.array([0.3, -0.2, 0.5]), design, 0.1, rng)
@@ -45,7 +45,7 @@ def test_evidence_of_any_size_is_a_mean_over_sizes_of_the_parts():
 
 
 def test_sizes_and_moments_are_those_of_the_change():
-    """A part that is well known has its size, one that is not shown at all any size."""
+    """A well-determined part has its true size; an undetermined part may have any size."""
     rng = np.random.default_rng(3)
     design = np.column_stack([rng.normal(size=(200, 20)), np.zeros((200, 20))])
     change = np.r_[rng.normal(0, 0.25, 20), np.zeros(20)]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A drift of the distortion: what healed rigs claim of it where no marker has passed."""
+"""Drift of the distortion: claims of healed rigs where no marker has passed."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ GRID = sd_grid_pixels(SIZE)
 
 
 def bent(observed, bend):
-    """Image points with a drift of b: quadratic and cubic, (6,) px at the edges."""
+    """Image points with a quadratic and cubic drift of b: (6,) px at the edges."""
     change = np.zeros(observed.uv.shape)
     change[..., B, :] = field_at(observed.pixel[..., B, :], bend)
     return observed.changed(change)
@@ -29,7 +29,7 @@ def field_at(uv, bend):
 
 
 def diagnosis_of(diagnostician, observed, poses, *changes):
-    """Diagnosis with these changes, as they are known."""
+    """Diagnosis with these changes taken as known."""
     adjustment = diagnostician.adjustment
     prior = adjustment.healthy_prior(observed, 1e-4)
     start = np.zeros(adjustment.size), poses
@@ -43,7 +43,7 @@ def diagnosis_of(diagnostician, observed, poses, *changes):
 
 
 def seen_by_b(observed):
-    """Whether pixels of the grid (n,) are among the markers that b has seen."""
+    """Whether grid pixels (n,) lie among the markers that b has seen."""
     pixel = observed.pixel[..., B, :][observed.seen[..., B]]
     inside = (np.abs(pixel - 511.5) < 512).all(axis=1)
     low, high = np.quantile(pixel[inside], [0.1, 0.9], axis=0)
@@ -51,7 +51,7 @@ def seen_by_b(observed):
 
 
 def test_affine_part_of_an_unseen_drift_is_left_to_the_rig():
-    """Where markers were, no shift, turn, scale or shear of the image remains."""
+    """At the markers, no shift, rotation, scale or shear of the image remains."""
     scene = Scene(3)
     diagnostician = scene.diagnostician()
     found = diagnosis_of(diagnostician, scene.observe(), scene.poses())
@@ -69,7 +69,7 @@ def test_affine_part_of_an_unseen_drift_is_left_to_the_rig():
 
 @pytest.mark.long
 def test_drift_that_passes_as_nothing_is_claimed_where_no_marker_has_passed():
-    """Over rigs: as large as it is far from the markers, and little where they were."""
+    """Over rigs, the claim matches the drift far from the markers and is small near them."""
     rng = np.random.default_rng(1)
     ratio = []
     for seed in range(3, 9):
@@ -90,7 +90,7 @@ def test_drift_that_passes_as_nothing_is_claimed_where_no_marker_has_passed():
 
 @pytest.mark.long
 def test_healed_drift_goes_on_where_no_marker_has_passed_and_claims_what_is_left():
-    """Its polynomials have the size that markers show, whatever the size of the diagnosis."""
+    """The polynomials have the size that the markers show, whatever the size of the diagnosis."""
     rng = np.random.default_rng(2)
     left, claimed, size = [], [], []
     for seed in range(3, 9):

@@ -39,13 +39,13 @@ MANY_EXPOSURES = dict(exposures=14, targets=20)  # eliminates the exposures
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """As in a calibration: two threads are slower for matrices of this size."""
+    """Use one thread, as a calibration does: two are slower for matrices of this size."""
     with threadpool_limits(1):
         yield
 
 
 def cost_at(network, result, x=None, correction=0.0):
-    """F at a solution moved by x, for its noise model."""
+    """F at a solution displaced by x, for its noise model."""
     parameters = result.parameters if x is None else rigs.moved(network, result.parameters, x)
     _, q = residuals_and_q(network, parameters, correction, result.noise)
     return total_cost(network, parameters, q, result.noise)
@@ -98,7 +98,7 @@ def test_gradient_of_the_cost_is_zero_at_the_solution(loss, shape):
         (cost_at(network, result, step * d) - cost_at(network, result, -step * d)) / (2 * step)
         for d in directions
     ]
-    assert np.linalg.norm(slope) < 2e-4  # a decrease of less than 2e-8 is left
+    assert np.linalg.norm(slope) < 2e-4  # the remaining decrease is less than 2e-8
     assert result.cost == pytest.approx(cost_at(network, result), rel=1e-12)
 
 
@@ -139,7 +139,7 @@ def test_gaussian_adjustment_equals_scipy_least_squares():
 @pytest.mark.long
 @pytest.mark.parametrize('loss', ['student_t', 'huber'])
 def test_no_better_solution_is_found_by_direct_minimisation(loss):
-    """For the same noise model, scipy cannot improve the solution, and finds it from elsewhere."""
+    """With the same noise model, scipy cannot improve the solution and finds it from elsewhere."""
     network, truth = rigs.small_network(exposures=3, targets=10, nu=4.0)
     result = adjust_and_estimate_noise(
         network, rigs.disturbed(truth), noise=Noise(loss), options=SolverOptions(tolerance=1e-12)
@@ -191,7 +191,7 @@ def test_both_eliminations_give_the_same_solution_and_covariances(shape, loss):
     'shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)]
 )
 def test_covariances_equal_the_dense_inverse(shape, loss, free):
-    """The unknowns by Fisher information, the residuals by the weighted problem."""
+    """Unknowns by the Fisher information, residuals by the weighted problem."""
     network, truth = rigs.small_network(**shape, nu=5.0, free=free)
     result = adjust_and_estimate_noise(network, truth, noise=Noise(loss))
     precise = precision(network, result)
@@ -285,7 +285,7 @@ def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
     """60 simulated adjustments: errors agree with their covariances."""
     errors, scales = normalised_errors(60, 'gaussian', exposures=6, targets=40)
     assert np.mean(scales) == pytest.approx(0.3, rel=0.02)
-    # Means of 180, of 2160 correlated and of 7200 hardly correlated squares of unit variance.
+    # Means of 180, of 2160 correlated, and of 7200 hardly correlated squares of unit variance.
     assert np.mean(errors['interior']) == pytest.approx(1, abs=0.3)
     assert np.mean(errors['exterior']) == pytest.approx(1, abs=0.2)
     assert np.mean(errors['points']) == pytest.approx(1, abs=0.05)
@@ -295,7 +295,7 @@ def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
 def test_standard_deviations_of_heavy_tailed_noise_against_monte_carlo():
     """The same for t noise with four degrees of freedom.
 
-    Without the factor (nu+4)/(nu+2) the squares would be 1.4.
+    Without the factor (nu+4)/(nu+2), the mean square would be 1.4.
     """
     errors, scales = normalised_errors(
         40, 'student_t', exposures=5, targets=80, nu=4.0, survey_sd_mm=0.02
@@ -306,7 +306,7 @@ def test_standard_deviations_of_heavy_tailed_noise_against_monte_carlo():
 
 
 def normalised(error, covariance):
-    """Squared errors (n,) in units of their covariances, divided by the number of unknowns."""
+    """Squared errors (n,) in units of their covariances, over the number of unknowns."""
     return np.einsum('na,nab,nb->n', error, np.linalg.inv(covariance), error) / error.shape[1]
 
 
@@ -326,7 +326,7 @@ def small_vectors(turn):
 
 
 def test_false_matches_do_not_move_the_solution():
-    """5 % false matches change the Student-t solution by a part of its standard deviation."""
+    """5 % false matches change the Student-t solution by a fraction of its standard deviation."""
     network, truth = rigs.small_network(exposures=6, targets=40)
     false = np.random.default_rng(1).permutation(len(network.uv))[: len(network.uv) // 20]
     uv = network.uv.copy()
@@ -370,7 +370,7 @@ def test_order_of_image_points_does_not_matter():
 
 
 def test_scale_is_relative_to_sigma():
-    """Ten times sigma gives a tenth of the scale; nothing else changes."""
+    """Ten times sigma gives a tenth of the scale and changes nothing else."""
     network, truth = rigs.small_network(**MANY_TARGETS)
     one = adjust_and_estimate_noise(network, rigs.disturbed(truth))
     other = adjust_and_estimate_noise(
@@ -381,8 +381,8 @@ def test_scale_is_relative_to_sigma():
 
 
 def test_image_points_with_small_sigma_dominate():
-    """Where two exposures contradict each other on a point, it goes where the more precise one
-    sees it.
+    """Where two exposures contradict each other on a point, it follows the one that is more
+    precise.
     """
     network, truth = rigs.small_network(
         exposures=6, targets=40, noise_px=0.3, survey_sd_mm=50.0, seen=1.0
@@ -417,7 +417,7 @@ def test_image_points_with_small_sigma_dominate():
 
 
 def test_held_interior_orientation_does_not_change():
-    """Also where that of the other fluoroscope is estimated."""
+    """Also if the interior orientation of the other fluoroscope is estimated."""
     network, truth = rigs.small_network(exposures=4, targets=30, fluoroscopes=2)
     network = replace(network, interior_free=np.array([False, True]))
     start = rigs.disturbed(truth)
@@ -430,7 +430,7 @@ def test_held_interior_orientation_does_not_change():
 
 
 def test_correction_is_subtracted_from_the_observed_points():
-    """Undistorted = observed - correction: distorted points with their correction adjust alike."""
+    """Undistorted = observed - correction: distorted points with it adjust equally."""
     network, truth = rigs.small_network(**MANY_TARGETS)
     correction = np.random.default_rng(1).normal(0, 5, network.uv.shape)
     one = adjust_and_estimate_noise(network, rigs.disturbed(truth))
@@ -460,7 +460,7 @@ def test_distant_start_values_give_the_same_solution():
 
 
 def test_start_off_the_gauge_gives_the_same_solution():
-    """A large first decrease allows no steps with its normal matrix: outliers would keep points
+    """The normal matrix of a large first decrease must not be reused: outliers would keep points
     that are lost on the way.
     """
     network, truth = rigs.small_network(exposures=6, targets=40, seed=5)
@@ -540,7 +540,7 @@ def test_given_noise_model_is_not_changed():
 
 
 def test_exact_observations_give_the_exact_solution():
-    """The noise scale stops at a hundredth of a pixel instead of vanishing."""
+    """The noise scale stops at a hundredth of a pixel instead of going to zero."""
     network, truth = rigs.small_network(**MANY_TARGETS, noise_px=0.0, survey_sd_mm=1e-9)
     network = replace(network, survey_sd_mm=np.full(30, 0.1))
     result = adjust_and_estimate_noise(network, rigs.disturbed(truth))

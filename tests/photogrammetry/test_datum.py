@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Free networks: inner constraints against dense bordered systems and other datums."""
+"""Free networks: inner constraints against dense bordered systems and other datum choices."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def free_network(free=True, **shape):
 
 
 def dense_free(network, result, factor=1.0):
-    """Dense normal matrix (u, u) of the images, and the inner constraints (7, u)."""
+    """Dense normal matrix (u, u) of the image points, and the inner constraints (7, u)."""
     counted = replace(network, datum='survey')
     a = rigs.design_matrix(counted, result.parameters)
     weight = factor * result.noise.weight(result.q) / (result.noise.scale * network.sigma) ** 2
@@ -110,7 +110,7 @@ def test_solution_and_covariances_equal_a_dense_bordered_system(shape, loss, fre
 
 @pytest.mark.parametrize('shape', SHAPES)
 def test_residuals_and_interior_orientation_equal_a_minimal_datum(shape):
-    """Seven numbers are held: the first exposure and one coordinate of the second source."""
+    """The minimal datum fixes the first exposure and one coordinate of the second source."""
     network, truth = free_network(**shape)
     noise = Noise('gaussian', 0.3)
     inner = adjust(
@@ -209,7 +209,7 @@ def test_wrong_survey_does_not_deform_a_free_network():
 
 @pytest.mark.parametrize('shape', SHAPES)
 def test_prior_of_the_interior_orientation_is_a_pseudo_observation(shape):
-    """Solution and covariances equal those of the dense normal matrix with its weights added."""
+    """Solution and covariances equal those of the dense normal matrix plus its weights."""
     network, truth = rigs.small_network(**shape)
     mean = truth.interior + [[3.0, -2.0, 30.0]]
     sd = np.array([[1.0, 2.0, 15.0]])

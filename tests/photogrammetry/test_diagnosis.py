@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reports of what a network cannot determine, and no false alarms."""
+"""Findings on what a network cannot determine, and absence of false alarms."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def one_thread():
 
 
 def frames_of_poses(poses, points, noise_px=0.25, seed=0):
-    """Frames and Phantom of points (n, 3) [mm] in poses (rotation, shift); the image axis is y."""
+    """Frames and Phantom of points (n, 3) [mm] in poses (rotation, shift); y is the image axis."""
     rng = np.random.default_rng(seed)
     look = looking_at_origin(SOURCE)
     frames = []
@@ -64,12 +64,12 @@ def frames_of_poses(poses, points, noise_px=0.25, seed=0):
 
 
 def beads(depth_mm, count=120, seed=1):
-    """Beads in a slab of 200 mm that is depth_mm thick along the axis of the image."""
+    """Beads in a slab of 200 mm whose thickness along the image axis is depth_mm."""
     return np.random.default_rng(seed).uniform(-1, 1, (count, 3)) * [100, depth_mm / 2, 100]
 
 
 def moved_across(count=6):
-    """Poses turned about the image axis and shifted across it, but not tilted."""
+    """Poses rotated about the image axis and shifted across it, but not tilted."""
     return [
         (matrix_from_vector([0, 0.9 * j, 0]), np.array([20.0 * (j % 3 - 1), 0, 15.0 * (j % 2)]))
         for j in range(count)
@@ -77,7 +77,7 @@ def moved_across(count=6):
 
 
 def tilted(count=6):
-    """The same poses, also tilted by half a radian."""
+    """The same poses, tilted by half a radian in addition."""
     return [
         (matrix_from_vector([0.5 * np.cos(1.1 * j), 0, 0.5 * np.sin(1.1 * j)]) @ rotation, shift)
         for j, (rotation, shift) in enumerate(moved_across(count))
@@ -222,7 +222,7 @@ def test_correlations_equal_the_dense_inverse():
 
 
 def test_undetermined_principal_point_is_reported():
-    """Judged by the precision at a noise of one pixel at most, whatever distortion adds."""
+    """Precision is judged at a noise of one pixel at most, whatever distortion adds."""
     network, truth = rigs.small_network()
     precise = precision(network, adjust_and_estimate_noise(network, truth))
     assert not undetermined_interiors(network, truth, precise, ('a',), 0.3)

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.long
 
 
 def small_problem():
-    """Network, start values and noise: six exposures of about thirty targets, heavy tails."""
+    """Network, initial values and noise: six exposures of about thirty targets, heavy tails."""
     network, truth = small_network(6, 40, noise_px=0.3, nu=4.0, seed=2, seen=0.8)
     network = replace(network, sigma=np.ones(len(network.uv)))
     return *drop_rarely_seen_points(network, disturbed(truth, degrees=0.2, mm=2.0), 2), Noise(
@@ -56,12 +56,12 @@ def real_problem():
 
 
 def all_fixed(network):
-    """All object points stay at their survey; exposures share only the interior orientation."""
+    """All object points are fixed; exposures share only the interior orientation."""
     return np.ones(len(network.survey_mm), dtype=bool)
 
 
 def few_fixed(network):
-    """Every tenth object point, and those seen in two exposures only, define the datum."""
+    """Every tenth object point, and those seen in only two exposures, define the datum."""
     return (np.arange(len(network.survey_mm)) % 10 == 0) | (np.bincount(network.point) < 3)
 
 
@@ -85,7 +85,7 @@ def test_adjustment_equals_colmap(problem, fixed_points):
     np.testing.assert_allclose(ours.parameters.position_mm, theirs.position_mm, atol=1e-4)
     np.testing.assert_allclose(ours.parameters.points_mm, theirs.points_mm, atol=1e-4)
 
-    # Ours is of the Fisher information: without its factor, that of the weighted normal matrix.
+    # Without the factor of the Fisher information, ours is that of the weighted normal matrix.
     covariance = noise.information_factor(ours.q) * precision(network, ours).interior[0]
     expected = colmap.interior_covariance()
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.sqrt(np.diag(expected)), rtol=1e-6)
@@ -96,7 +96,7 @@ def test_adjustment_equals_colmap(problem, fixed_points):
 
 @pytest.mark.parametrize('seed', [1, 2])
 def test_k_of_a_calibration_equals_grid_search(seed):
-    """Values of a calibration, folds of whole exposures, equal weights."""
+    """Values of a real calibration, whole exposures as folds, equal weights."""
     rig = virtual_rig(seed)
     frames = {
         'a': simulate_exposures(rig, 15, seed, detection=Detection(beads=(130, 134))).frames['a']
@@ -104,7 +104,7 @@ def test_k_of_a_calibration_equals_grid_search(seed):
     run = calibrate(frames, rig.phantom, CalibrationOptions('knn', max_iterations=2)).runs['a']
     network = run.measured.network
     inside = np.flatnonzero(run.trained)
-    # Of coincident pixels either may come first among the neighbours.
+    # Coincident pixels have no defined order among the neighbours, so keep one of them.
     inside = inside[np.sort(np.unique(network.uv[inside], axis=0, return_index=True)[1])]
     uv = network.uv[inside]
     values = (run.after.residuals + run.correction)[inside]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Covariances of adjustments with held interior orientations that are not known exactly."""
+"""Covariances of adjustments whose fixed interior orientations are uncertain."""
 
 from dataclasses import replace
 
@@ -14,11 +14,11 @@ from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision, precision_with_fixed_interiors
 
 NOISE = Noise('gaussian', 0.3)
-SD_PX = np.array([2.0, 3.0, 4.0])  # of xp, yp and c
+SD_PX = np.array([2.0, 3.0, 4.0])  # standard deviations of xp, yp and c
 
 
 def held(network, truth, interior, noise=0.0):
-    """Adjustment of observations with noise, the interior orientation held."""
+    """Adjustment of noisy observations with the interior orientation fixed."""
     network = replace(network, uv=network.uv + noise)
     start = replace(truth, interior=interior)
     return network, adjust(network, start, noise=NOISE)
@@ -48,7 +48,7 @@ def test_covariances_are_those_of_consider_parameters(shape):
 
 
 def test_errors_of_sources_agree_with_their_covariances():
-    """Monte Carlo over noise, survey and the error of the interior orientation that is held."""
+    """Monte Carlo over noise, survey and the error of the fixed interior orientation."""
     rng = np.random.default_rng(3)
     squares = []
     without = []

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise that differs between the middle of an image and its rim."""
+"""Noise that differs between the centre of an image and its rim."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ SIZE = (1024, 768)
 
 
 def drawn(rng, rim_over_middle, count=2000, nu=np.inf):
-    """Image points, and mean squares of errors; standard deviation 0.2 px in the middle."""
+    """Image points and mean squared errors; the standard deviation is 0.2 px in the middle."""
     uv = rng.uniform(0, 1, (count, 2)) * SIZE
     square = np.sum((uv - np.array([511.5, 383.5])) ** 2, axis=1) / 512**2
     noise = rng.normal(0, 1, (count, 2))
@@ -31,7 +31,7 @@ def drawn(rng, rim_over_middle, count=2000, nu=np.inf):
 
 @pytest.mark.parametrize('ratio', [0.4, 1.3, 4.0])
 def test_profile_is_that_of_a_gamma_regression(ratio):
-    """As scikit-learn makes it, of the same squares."""
+    """Compare with scikit-learn's regression of the same squares."""
     uv, squares = drawn(np.random.default_rng(6), ratio)
     x = np.sum((uv - np.array([511.5, 383.5])) ** 2, axis=1, keepdims=True) / 512**2
     peer = GammaRegressor(alpha=0, tol=1e-8, solver='newton-cholesky').fit(x, squares)
@@ -61,7 +61,7 @@ def test_squares_are_as_large_as_claimed_in_the_middle_and_at_the_rim():
 
 @pytest.mark.parametrize('nu', [np.inf, 8.0])
 def test_same_noise_everywhere_has_no_profile_but_by_chance(nu):
-    """One of 20 images, and then a slight one."""
+    """A profile is found in one of 20 images, and then it is slight."""
     rng = np.random.default_rng(3)
     found = [fitted_profile(*drawn(rng, 1.0, nu=nu), SIZE) for _ in range(200)]
     ratios = [f.rim / f.middle for f in found if f is not None]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Outlier tests: false alarms on clean data, gross errors that must be found."""
+"""Outlier tests: few false alarms on clean data, and detection of gross errors."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def adjusted(network, truth, loss='student_t'):
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t', 'huber'])
 @pytest.mark.long
 def test_false_alarms_on_clean_data(loss):
-    """At 1 % a network, 20 networks raise hardly any; the statistics have their quantiles."""
+    """At 1 % per network, 20 networks raise hardly any; statistics match their quantiles."""
     alarms = 0
     image = []
     target = []
@@ -115,7 +115,7 @@ def test_limits_of_the_f_distribution_are_those_of_scipy():
 
 
 def with_false_matches(network, share, seed):
-    """The network with a share of its image points anywhere in an image of 1024 px."""
+    """The network with a share of its image points placed anywhere in an image of 1024 px."""
     rng = np.random.default_rng(seed)
     false = rng.random(network.n_image_points) < share
     uv = np.where(false[:, None], rng.uniform(0, 1023, network.uv.shape), network.uv)

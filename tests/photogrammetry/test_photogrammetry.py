@@ -35,7 +35,7 @@ ANGLES = [0.0, 1e-15, 1e-9, 1e-5, 0.3, np.pi / 2, 3.0, np.pi - 1e-5, np.pi - 1e-
 
 
 def some_axes():
-    """Unit vectors: the six axes, and others."""
+    """Unit vectors: the six coordinate axes, and others."""
     rng = np.random.default_rng(1)
     other = rng.normal(size=(40, 3))
     return np.concatenate(
@@ -83,7 +83,7 @@ def test_rotation_vectors_keep_small_turns_to_the_last_digit():
 
 
 def test_quaternions_are_normalised_and_follow_the_convention():
-    """w, x, y, z: a quarter turn about z takes x to y for a quaternion of any norm."""
+    """Order w, x, y, z: a quarter turn about z takes x to y, for a quaternion of any norm."""
     np.testing.assert_allclose(
         matrix_from_quaternion([3.0, 0, 0, 3.0]) @ [1, 0, 0], [0, 1, 0], atol=1e-15
     )
@@ -175,7 +175,7 @@ def one_exposure(seed=0, targets=60):
 
 @pytest.mark.parametrize('seed', range(5))
 def test_resection_of_exact_data_is_exact(seed):
-    """From the smallest accepted number of targets, in any attitude."""
+    """From the minimum number of targets, in any attitude."""
     xyz, uv, rotation, position, interior = one_exposure(seed, targets=8)
     assert principal_distance_of(robust_dlt(xyz, uv)) == pytest.approx(interior[2], rel=1e-6)
     found = resect(xyz, uv, interior)
@@ -185,8 +185,8 @@ def test_resection_of_exact_data_is_exact(seed):
 
 
 def test_projection_matrix_is_decomposed_into_its_parts():
-    """decompose: calibration matrix with positive diagonal, rotation and source, whatever the
-    matrix's sign.
+    """decompose: calibration matrix with positive diagonal, rotation and source, whatever the sign
+    of the matrix.
     """
     _, _, rotation, position, (xp, yp, c) = one_exposure()
     k = np.array([[c, 0, xp], [0, c, yp], [0, 0, 1]])
@@ -198,7 +198,7 @@ def test_projection_matrix_is_decomposed_into_its_parts():
 
 
 def test_direct_linear_transformation_uses_its_weights():
-    """Points of weight zero have no influence."""
+    """Points of zero weight have no influence."""
     xyz, uv, *_ = one_exposure()
     spoilt = uv.copy()
     weights = np.ones(len(uv))
@@ -223,7 +223,7 @@ def test_resection_is_robust_to_false_matches_and_distortion(seed):
     assert rotation_angle(found.rotation @ rotation.T) < np.deg2rad(0.3)
     assert (
         np.linalg.norm(found.position_mm - position) < 15
-    )  # of 1500 mm; what the distortion does
+    )  # of 1500 mm, the effect of the distortion
     assert found.scale < 3
     moved_far = (
         np.linalg.norm(
@@ -283,7 +283,7 @@ def test_cost_is_the_negative_log_likelihood_of_scipy():
 def test_density_of_every_loss_integrates_to_one(loss):
     noise = Noise(loss, 0.6, 4.0)
     sigma = np.array([1.7])
-    unit = noise.scale * sigma[0]  # of the radius r [px]
+    unit = noise.scale * sigma[0]  # unit of the radius r [px]
     inside, _ = integrate.quad(
         lambda r: 2 * np.pi * r * np.exp(-noise.cost(np.array([(r / unit) ** 2]), sigma)),
         0,
@@ -329,7 +329,7 @@ def test_information_factor_against_monte_carlo(loss, nu):
         place = np.sum(w * x, axis=1, keepdims=True) / np.sum(w, axis=1, keepdims=True)
     q = np.sum((x - place) ** 2, axis=2).ravel()
     expected = 1 / (noise.information_factor(q) * n * np.mean(noise.weight(q)))
-    # 3000 estimates: their variance is known to 2.6 %.
+    # The variance of 3000 estimates is known to 2.6 %.
     assert np.mean(place**2) == pytest.approx(expected, rel=0.08)
 
 
@@ -366,8 +366,8 @@ def test_scale_and_degrees_of_freedom_equal_direct_maximum_likelihood(nu):
 
 @pytest.mark.parametrize('loss', LOSSES)
 def test_scale_is_estimated_from_residuals_of_unequal_redundancy(loss):
-    """Residuals are smaller than the noise by the root of their redundancy numbers; the scale is
-    that of the noise.
+    """Residuals are smaller than the noise by the root of their redundancy numbers. The estimated
+    scale is that of the noise.
     """
     rng = np.random.default_rng(8)
     share = rng.choice([0.2, 0.9], 60_000)
@@ -380,8 +380,8 @@ def test_scale_is_estimated_from_residuals_of_unequal_redundancy(loss):
 
 @pytest.mark.parametrize('nu', [4.0, 200.0])
 def test_estimated_gross_errors_do_not_affect_the_core(nu):
-    """One in twenty false matches all over the image: scale and degrees of freedom are those
-    without them.
+    """One in twenty points is a false match anywhere in the image: scale and degrees of freedom
+    are those without them.
     """
     rng = np.random.default_rng(4)
     noise = bivariate_t(rng, 20_000, nu, 0.25)
@@ -428,7 +428,7 @@ def test_inliers_are_9999_of_10000_gaussian_residuals():
 
 @pytest.mark.parametrize('nu, share', [(3.0, 0.025), (6.0, 0.004), (8.0, 0.002), (200.0, 0.001)])
 def test_few_true_image_points_are_gross_errors(nu, share):
-    """Up to the limit of six sigma, beyond which heavier tails are not believed."""
+    """The limit is at most six sigma; heavier tails are not considered plausible."""
     rng = np.random.default_rng(11)
     q = np.sum(bivariate_t(rng, 100_000, nu, 1.0) ** 2, axis=1)
     noise = Noise(nu=nu, gross=0.01)

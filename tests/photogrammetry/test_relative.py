@@ -55,7 +55,7 @@ def one_thread():
 def rigid_network(exposures=4, targets=30, sd=SOFT, seed=0, alone=1, nu=np.inf, length_mm=None):
     """Joint Network of two fluoroscopes of a rigid rig, and its true Parameters.
 
-    The last `alone` exposures are not paired.
+    The last `alone` exposures have no partner.
     """
     network, truth = rigs.small_network(exposures, targets, 2, seed=seed, nu=nu, seen=0.9)
     a = np.arange(exposures)
@@ -163,7 +163,7 @@ def test_covariances_equal_the_dense_inverse(shape, loss):
     sd = np.sqrt(np.diagonal(expected))
 
     def assert_equal(block, rows, columns):
-        """Compare in standard deviations: elements near zero are differences of larger ones."""
+        """Compare in standard deviations, as elements near zero are differences of larger ones."""
         error = block - expected[rows, columns]
         assert np.max(np.abs(error) / np.outer(sd[rows], sd[columns])) < 1e-7
 
@@ -315,7 +315,7 @@ def reparametrisation(plain, parameters, constraint):
 
 
 def test_constraint_reduces_scatter_and_errors():
-    """Scatter and errors of the relative orientation fall with its standard deviation."""
+    """Scatter and errors of the relative orientation decrease with its standard deviation."""
     scatter = []
     error = []
     for sd in ((1e3, 1.0), SOFT, (RIGID_SD_MM, RIGID_SD_RAD)):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Limits of gross errors follow the observed scatter, and only where it exceeds what is stated."""
+"""Gross error limits follow the observed scatter, but only if it exceeds the stated one."""
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ from fluoro_calib_ros.photogrammetry.noise import (
     widening_by_group,
 )
 
-MEDIAN = 0.6745  # of absolute standard normal errors
+MEDIAN = 0.6745  # median of absolute standard normal errors
 LIMIT = 4 / MEDIAN
 
 
 def errors(rng, count, factor=1.0, false=0.0):
-    """Sizes of normal errors, a share of them of false matches."""
+    """Absolute normal errors, a share of them replaced by false matches."""
     size = factor * np.abs(rng.normal(size=count))
     wrong = rng.random(count) < false
     size[wrong] = np.abs(rng.normal(0, 40, int(wrong.sum())))
@@ -44,7 +44,7 @@ def test_true_errors_are_kept_where_sigma_is_understated(factor):
 
 
 def test_error_in_common_is_no_scatter():
-    """A rig orientation of which all errors are twice its standard deviation off."""
+    """All errors are twice the standard deviation of a rig orientation."""
     size = np.full(500, 2 / MEDIAN)
     assert widening(size, LIMIT, common=1.0) == 1.0
     assert widening(size, LIMIT) > 1.5
@@ -52,8 +52,8 @@ def test_error_in_common_is_no_scatter():
 
 @pytest.mark.parametrize('common', [0.2, 0.5, 0.8])
 def test_variance_in_common_counts_for_what_it_is(common):
-    """An error in common of three of its standard deviations is what chance explains."""
-    count = 10**5  # the rest is known well
+    """A common error of up to three of its standard deviations is explained by chance."""
+    count = 10**5  # large enough that the median is known well
     size = np.full(count, 2.9)
     chance = (1 - common) + common * 3.0**2
     assert widening(size, LIMIT, common) == pytest.approx(max(1, 2.9 / chance**0.5), rel=0.01)

@@ -76,7 +76,7 @@ def moved(orientation, step):
 
 
 def projected(orientation, xyz):
-    """Image points (F, n, 2) of points (n, 3), written out point by point with Eq. 1."""
+    """Image points (F, n, 2) of points (n, 3), computed point by point with Eq. 1."""
     out = []
     for (xp, yp, c), rotation, position in zip(
         orientation.interior, orientation.rotation, orientation.position_mm
@@ -95,7 +95,7 @@ def seen(orientation, count=30, seed=0, noise_px=SIGMA):
 
 
 def central(function, count, steps):
-    """Derivatives (..., count) of a function of count numbers by central differences."""
+    """Derivatives (..., count) of a function of count numbers, by central differences."""
     columns = []
     for i in range(count):
         step = np.zeros(count)
@@ -109,7 +109,7 @@ STEPS = [1e-2] * 3 + [1e-6] * 3 + [1e-2] * 3
 
 @pytest.mark.parametrize('names', [('a', 'b'), ('a', 'b', 'c')])
 def test_intersection_is_the_least_squares_solution(names):
-    """The same points as scipy's, with a different sigma for every image point."""
+    """Same points as by scipy, with a different sigma for every image point."""
     orientation = orientation_of(names)
     _, uv, sigma = seen(orientation, 12)
     sigma = sigma * np.random.default_rng(3).uniform(0.5, 2, sigma.shape)
@@ -138,7 +138,7 @@ def test_intersection_is_the_least_squares_solution(names):
 
 
 def test_limit_follows_the_scatter_of_a_recording():
-    """Noise is twice what sigma says, and one match in ten is false."""
+    """The noise is twice the stated sigma, and one match in ten is false."""
     orientation = orientation_of(uncertain=0.3)
     intersector = Intersector(orientation)
     scatter = ObservedScatter()
@@ -159,12 +159,12 @@ def test_limit_follows_the_scatter_of_a_recording():
 
 
 def test_pycolmap_triangulates_the_same_points():
-    """It minimises angles; with equal weights this differs by less than the noise."""
+    """COLMAP minimises angles; with equal weights, this differs by less than the noise."""
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 10)
     found = Intersector(orientation).intersect(uv, sigma)
     cameras = []
-    for xp, yp, c in orientation.interior:  # its pixels begin at the corner of the image
+    for xp, yp, c in orientation.interior:  # COLMAP pixels start at the image corner
         cameras.append(
             pycolmap.Camera(
                 model='SIMPLE_PINHOLE', width=1024, height=1024, params=[c, xp + 0.5, yp + 0.5]
@@ -198,7 +198,7 @@ def test_derivatives_of_the_image_points_by_the_orientation():
 
 @pytest.mark.parametrize('names', [('a', 'b'), ('a', 'b', 'c')])
 def test_covariance_is_that_of_noise_and_orientation(names):
-    """Propagated with the derivatives of the intersected point as finite differences."""
+    """Reference: propagation with finite differences of the intersected point."""
     orientation = orientation_of(names)
     _, uv, sigma = seen(orientation, 5, noise_px=0)
     found = Intersector(orientation).intersect(uv, sigma)
@@ -257,7 +257,7 @@ def test_covariance_against_monte_carlo():
 
 
 def test_epipolar_distance_and_its_standard_deviations():
-    """Signs, normals, factors and standard deviations against finite differences."""
+    """Signs, normals, factors and standard deviations, against finite differences."""
     orientation = orientation_of()
     _, uv, _ = seen(orientation, 8)
     geometry = EpipolarGeometry(orientation, 'a', 'b')
@@ -297,7 +297,7 @@ def test_epipolar_distance_and_its_standard_deviations():
 
 
 def test_epipolar_distance_is_the_smallest_shift_that_makes_the_rays_meet():
-    """For two views of equal sigma it is the length of the residuals, also standardised."""
+    """For two views of equal sigma, it is the length of the residuals, also if standardised."""
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 8)
     distance = EpipolarGeometry(orientation, 'b', 'a').residuals(*uv[::-1], SIGMA, SIGMA)
@@ -321,7 +321,7 @@ def test_epipolar_nan_stays_nan():
 
 
 def test_false_match_of_two_views_is_rejected():
-    """A shift across the epipolar line is seen, one along it is not."""
+    """A shift across the epipolar line is detected, a shift along it is not."""
     orientation = orientation_of()
     xyz, uv, sigma = seen(orientation)
     normal = EpipolarGeometry(orientation, 'a', 'b').residuals(*uv, SIGMA, SIGMA).normal_b
@@ -362,7 +362,7 @@ def test_false_match_of_more_views_loses_its_ray(names):
 
 
 def test_false_match_loses_its_ray_where_other_points_are_seen_by_two():
-    """Points of two, three and one view in one frame are as those of frames of their own."""
+    """Points of two, three and one view in one frame give the same as in separate frames."""
     orientation = orientation_of(('a', 'b', 'c'))
     _, uv, sigma = seen(orientation, 12)
     uv[2, 4] += 40.0  # a false match of the third view
@@ -384,7 +384,7 @@ def test_false_match_loses_its_ray_where_other_points_are_seen_by_two():
 
 
 def test_points_seen_by_few_fluoroscopes():
-    """Every point is intersected from its own rays."""
+    """Every point is intersected from the rays that it has."""
     orientation = orientation_of(('a', 'b', 'c'))
     _, uv, sigma = seen(orientation, 6)
     uv[0, 0] = np.nan
@@ -420,7 +420,7 @@ def test_points_outside_the_calibrated_area_have_a_status():
 
 
 def test_rays_that_do_not_meet_in_front_of_the_sources():
-    """Behind the source, parallel, or from one place: a status and NaN, no exception."""
+    """Behind the source, parallel, or from one place: status and NaN, but no exception."""
     orientation = orientation_of()
     across = orientation.rotation[1] @ orientation.rotation[0].T
     direction = np.array([0.0, 0.0, 1.0])
@@ -502,7 +502,7 @@ def test_invalid_orientations_are_refused(change, sentence):
 
 
 def test_orientation_by_name():
-    """Subsets in any order keep the values of each fluoroscope; the id follows the content."""
+    """Subsets in any order keep the values of each fluoroscope; the id depends on the content."""
     orientation = orientation_of(('a', 'b', 'c'))
     part = orientation.subset(['c', 'a'])
     assert part.fluoroscopes == ('c', 'a') and part.calibration_ids == ('c', 'a')
@@ -592,7 +592,7 @@ def recording(count=3, **change):
 
 @pytest.mark.long
 def test_recording_frame_by_frame():
-    """Observed points are corrected first; frames without partner are counted."""
+    """Observed points are corrected first; frames without a partner are counted."""
     frames, calibrations, intersector, xyz = recording()
     frames['b'] = [replace(frames['b'][0], target_id=np.array([3, 1, 8])), *frames['b'][2:]]
     found, unpaired = reconstruct_recording(frames, calibrations, intersector)

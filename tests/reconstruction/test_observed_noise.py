@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Image points without sigma have the noise that their rays show, where it is noise."""
+"""Image points without sigma get the noise that their rays show, if it is noise."""
 
 import functools
 from dataclasses import replace
@@ -19,13 +19,13 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.observed_noise import with_observed_noise
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
-BEADS_PX = 0.05  # noise of the calibration
+BEADS_PX = 0.05  # noise of the image points of the calibration
 RATE_HZ = 100.0
 
 
 @functools.cache
 def rig(names):
-    """A rig without distortion, its true calibrations and orientation."""
+    """A rig without distortion, with its true calibrations and orientation."""
     made = virtual_rig(7, strength=0.0, names=tuple(names), between_deg=60.0)
     calibrations = true_calibrations(made.fluoroscopes, BEADS_PX)
     return made, calibrations, true_orientation(made.fluoroscopes, calibrations)
@@ -42,7 +42,7 @@ def observed(frames, names='ab', **options):
 
 
 def turned(orientation, degrees):
-    """The orientation after its second fluoroscope has been knocked."""
+    """The orientation after a knock of its second fluoroscope."""
     rotation = orientation.rotation.copy()
     rotation[1] = matrix_from_vector(np.radians([degrees, 0, 0])) @ rotation[1]
     return replace(orientation, rotation=rotation)

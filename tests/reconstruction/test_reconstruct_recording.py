@@ -42,7 +42,7 @@ def rig(names='abc'):
 
 @functools.cache
 def known(names='abc'):
-    """Calibrations and orientation of the rig, true, with a small covariance."""
+    """Calibrations and orientation of the rig: true values with a small covariance."""
     fluoroscopes = rig(names).fluoroscopes
     calibrations = true_calibrations(fluoroscopes, NOISE_PX)
     return calibrations, true_orientation(fluoroscopes, calibrations)
@@ -54,7 +54,7 @@ def tracking(seconds, rate_hz, names='abc'):
 
 
 def shifted(frames, name, begin_s, end_s=np.inf, size_px=1.0):
-    """Frames whose left half of the image of a fluoroscope is shifted down between two times."""
+    """Frames in which the left half of a fluoroscope's image is shifted down for some time."""
 
     def change(frame):
         t = (frame.stamp_ns - frames[name][0].stamp_ns) / 1e9
@@ -73,7 +73,7 @@ def shifted(frames, name, begin_s, end_s=np.inf, size_px=1.0):
 
 
 def watched(frames, names, clusters=(), options=DriftOptions()):
-    """RecordingDriftWatch after a recording."""
+    """RecordingDriftWatch after it has processed a recording."""
     calibrations, orientation = known(names)
     watch = RecordingDriftWatch(
         orientation,
@@ -113,7 +113,7 @@ def test_a_missing_view_is_matched_as_one_that_sees_nothing():
 
 @pytest.mark.parametrize('missing', 'abc')
 def test_without_a_view_the_points_are_those_of_the_other_two(missing):
-    """The same numbers as with a rig of two; all three together are more accurate."""
+    """The numbers are those of a rig of two; all three together are more accurate."""
     calibrations, orientation = known()
     frames = tracking(0.5, 40).frames
     others = [name for name in 'abc' if name != missing]
@@ -146,8 +146,8 @@ def test_without_a_view_the_points_are_those_of_the_other_two(missing):
 @pytest.mark.parametrize('by', ['frame_number', 'stamp'])
 @pytest.mark.parametrize('seed', range(3))
 def test_every_exposure_of_two_views_is_reconstructed(by, seed):
-    """With views lost at random and one fluoroscope off for the second half: once each, in order
-    of time.
+    """With views lost at random and one fluoroscope off for the second half, each exposure occurs
+    once, in order of time.
     """
     rng = np.random.default_rng(seed)
     (calibrations, orientation) = known()
@@ -155,7 +155,7 @@ def test_every_exposure_of_two_views_is_reconstructed(by, seed):
     there = {name: rng.random(40) < 0.7 for name in 'abc'}
     there['b'][20:] = False
     kept = {name: [f for f, here in zip(frames[name], there[name]) if here] for name in 'abc'}
-    if by == 'stamp':  # numbered otherwise, with stamps that differ a little
+    if by == 'stamp':  # different numbers, and stamps that differ slightly
         kept = {
             name: [
                 replace(f, number=f.number + 7 * k, stamp_ns=f.stamp_ns + 300_000 * k)
@@ -191,7 +191,7 @@ def test_a_target_in_one_view_of_two_has_the_status_single_view():
 
 @functools.cache
 def drifted():
-    """Frames of a recording that drifts, and the watch after it."""
+    """Frames of a drifting recording, and the watch after processing it."""
     frames = shifted(tracking(30.0, 30.0, 'ab').frames, 'b', 16.0)
     return frames, watched(frames, 'ab')
 
@@ -214,7 +214,7 @@ def test_a_drift_of_a_recording_is_found_and_reported():
 @pytest.mark.long
 @pytest.mark.parametrize('outside', [True, False])
 def test_points_beyond_the_calibrated_area_are_no_drift(outside):
-    """The correction is extrapolated there: its error may be a pixel and change with the place."""
+    """The correction is extrapolated there: its error may be a pixel and vary over the image."""
     calibrations, orientation = known('ab')
     watch = RecordingDriftWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
     frames = shifted(tracking(20, 120, 'ab').frames, 'a', 12.0)
@@ -236,7 +236,7 @@ def test_points_beyond_the_calibrated_area_are_no_drift(outside):
 
 @pytest.mark.long
 def test_the_state_is_that_of_a_watch_fed_frame_by_frame():
-    """A RecordingDriftWatch does what the RigDriftWatch of the node does."""
+    """A RecordingDriftWatch gives the states of the RigDriftWatch in the node."""
     calibrations, orientation = known('ab')
     frames, watch = drifted()
     live = RigDriftWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
@@ -269,7 +269,7 @@ def test_a_healthy_recording_is_ok():
 
 @pytest.mark.long
 def test_an_undecided_verdict_is_not_ok():
-    """Too short, without common markers, and with too few of them."""
+    """Recordings that are too short, or have no or too few common markers."""
     frames = tracking(30.0, 30.0, 'ab').frames
     short = watched({name: of_one[:320] for name, of_one in frames.items()}, 'ab').verdict()
     assert short.level == 'learning' and short.finding.kind is Kind.SHORT_RECORDING
@@ -286,7 +286,7 @@ def test_an_undecided_verdict_is_not_ok():
 
 @pytest.mark.long
 def test_missing_views_are_no_drift_and_hide_none():
-    """Of three fluoroscopes one is off for half of the time and loses frames: its pairs have a
+    """Of three fluoroscopes, one is off for half of the time and loses frames: its pairs have a
     start of their own.
     """
     frames = tracking(30.0, 30.0).frames
@@ -307,7 +307,7 @@ def test_missing_views_are_no_drift_and_hide_none():
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """Calibrations and orientation of a rig of three, with healthy, drifted and short bags."""
+    """Calibrations and orientation of a rig of three, with healthy, drifting and short bags."""
     path = tmp_path_factory.mktemp('recording')
     calibrations, orientation = known()
     for calibration in calibrations.values():
@@ -343,7 +343,7 @@ def document(capsys, *arguments):
 
 @pytest.mark.long
 def test_reconstruct_reports_a_drift_and_missing_views(folder, capsys):
-    """It writes the points nevertheless, with exit status 0."""
+    """The command writes the points nevertheless and exits with status 0."""
     said = document(capsys, *command(folder, 'drifted'))
     drift = said['drift']
     assert (
@@ -395,7 +395,7 @@ def test_reconstruct_reports_where_no_drift_can_be_detected(folder, capsys):
         table['drift']['level'] == 'unknown'
         and 'does not contain the times' in table['drift']['message']
     )
-    assert table['frames'] == 40 and table['incomplete'] == 20  # c takes every other one
+    assert table['frames'] == 40 and table['incomplete'] == 20  # c records every other exposure
 
 
 @pytest.mark.parametrize(

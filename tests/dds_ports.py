@@ -66,9 +66,8 @@ _next_domain = itertools.count(os.getpid())
 def free_domain():
     """Return an unused ROS domain of this machine, and the open lock file that reserves it.
 
-    The most recently used domain comes up last. Domains in which a killed process has left ports
-    in shared memory are tried after all others: Fast DDS may take these ports for broken, and then
-    messages are lost.
+    The last used domain comes up last, and those in which a killed process left ports in shared
+    memory after all others: Fast DDS may take these ports for broken, and messages are lost.
     """
     base = int(os.environ[BASE])
     first = next(_next_domain)

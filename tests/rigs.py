@@ -54,11 +54,10 @@ def kinds(findings):
 
 
 def adjusted(noise_px, **rmse):
-    """Return what the checks of an adjustment take: result, calibrations, and frames of two
-    points each.
+    """Return what checks take of an adjustment of frames of two points each: result, calibrations,
+    frames.
 
-    noise_px: noise of the calibrations. rmse: {fluoroscope: (before, after)} of the residuals
-    [px].
+    noise_px: noise of the calibrations. rmse: {fluoroscope: (before, after)} of residuals [px].
     """
     names = [*rmse]
     frames = {
@@ -156,10 +155,7 @@ class NetworkOptions:
 
 
 def small_network(exposures=4, targets=30, fluoroscopes=1, seed=0, **options):
-    """Return a Network and its true Parameters.
-
-    The targets lie in a box of 200 mm; each exposure sees some of them.
-    """
+    """Return a Network and true Parameters: targets in a 200 mm box, seen partly per exposure."""
     options = NetworkOptions(**options)
     rng = np.random.default_rng(seed)
     true_mm = rng.uniform(-100, 100, (targets, 3))
@@ -294,8 +290,7 @@ def turning(
 ) -> FluoroscopeCalibration:
     """Return a calibration whose correction also changes with an angle, as for a C-arm.
 
-    The calibrated angles are -degrees to +degrees; size_px is the standard deviation of the
-    coefficients of each harmonic.
+    The calibrated angles are up to +-degrees; size_px: deviation of coefficients per harmonic.
     """
     rng = np.random.default_rng(5)
     field = AngleField(

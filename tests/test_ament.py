@@ -3,8 +3,7 @@
 
 """The linters of ament if they are installed, and otherwise their rules.
 
-The rules of flake8 are those of ruff, which tests/test_lint.py runs; package.xml follows
-REP 149.
+flake8 has the rules of ruff, see tests/test_lint.py; package.xml follows REP 149.
 """
 
 import importlib.util
@@ -19,8 +18,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (ROOT, ROOT / 'msg_defs')
-# As in pyproject.toml: a summary may take two lines, need not be imperative, and may start with
-# a lower-case name.
+# As in pyproject.toml: a summary may take two lines, be a noun, and start in lower case.
 PEP257 = ['D101', 'D102', 'D103', 'D105', 'D107', 'D205', 'D400', 'D401', 'D403']
 PYTHON = subprocess.run(
     ['git', 'ls-files', '*.py'], cwd=ROOT, capture_output=True, text=True, check=True

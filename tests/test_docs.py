@@ -47,10 +47,7 @@ def test_pages_that_sources_name_exist():
 
 
 def test_picture_of_the_rooms_shows_those_that_there_are():
-    """The rooms are drawn from top to bottom in the order of the import contract.
-
-    entry_points is not drawn: it only names other rooms.
-    """
+    """The order is that of the import contract, without entry_points, which only names others."""
     layers = re.search(r'^layers = \[(.*?)^\]', (ROOT / 'pyproject.toml').read_text(), re.M | re.S)
     rooms = re.findall(r'\w+', layers[1])
     picture = (ROOT / 'docs/images/architecture.svg').read_text()

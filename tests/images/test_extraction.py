@@ -116,10 +116,7 @@ OVERLAPPING = np.array([[40.2, 40.4], [55.9, 40.9], [100.3, 40.1]])
 def blurred_shadows(
     centres: np.ndarray, radii: np.ndarray, light: float, attenuation: float
 ) -> np.ndarray:
-    """Return light (80, 140) behind spheres with radii (n,), blurred by 1 px.
-
-    attenuation: along a radius of 12 px.
-    """
+    """Return light (80, 140) behind spheres (n,) [px]; attenuation along 12 px, blur of 1 px."""
     axis = np.arange(0, 560) / 4
     u, v = np.meshgrid(axis, axis[:320])
     grey = light * np.ones(u.shape)
@@ -157,10 +154,7 @@ def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
 
 
 def test_a_shadow_that_a_larger_one_hides_is_less_sure():
-    """Its error follows from the errors of both radii where the edge is hidden.
-
-    The larger bead hardly moves.
-    """
+    """Its error is that by both radii where the edge is hidden; the larger bead hardly moves."""
     profile = Profile(6.0, 1.0, 0.6, 0.0)
     size = np.array([1.0, 2.0])
     uv = np.array([[40.2, 40.4], [50.6, 40.9]])
@@ -173,8 +167,7 @@ def test_a_shadow_that_a_larger_one_hides_is_less_sure():
     )
     moved = np.linalg.norm(large.uv - small.uv, axis=1) / 2
     assert moved[0] > 2 * moved[1]
-    # Per coordinate, for an error of a hundredth of the radius. Here both radii change together,
-    # and the larger bead moves less.
+    # A coordinate, for 1 % of the radii; here both radii change, and the larger bead moves less.
     expected = 10 * moved / np.sqrt(2)
     assert right.sigma[0] == pytest.approx(expected[0], rel=0.2)
     assert expected[1] < right.sigma[1] < 2 * expected[1]

@@ -382,10 +382,7 @@ RADIUS = 8.0
 
 
 def radiograph_of_pairs(scatter: float, photons: float = 300) -> tuple[np.ndarray, Expected]:
-    """Return a radiograph (h, w) in scattered light, and the shadows.
-
-    20 spheres are isolated and 16 are in pairs.
-    """
+    """Return a radiograph (h, w) with scatter, and shadows: 20 spheres alone and 16 in pairs."""
     rng = np.random.default_rng(3)
     row, column = np.divmod(np.arange(28), 6)
     place = PITCH * (np.column_stack([column, row]) + 0.5) + rng.uniform(-3, 3, (28, 2))

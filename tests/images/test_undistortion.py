@@ -68,9 +68,8 @@ def random_image(dtype, size=SIZE):
 
 def off(image, light, uv, reach=9):
     """Return distances (n, 2) [px] of the blobs in an image (h, w) from nearby pixels uv (n, 2).
-
-    `light` (h, w) is the image without blobs. A Gaussian with its first and second moments is
-    fitted by least squares, on a plane.
+    The blobs are missing in light (h, w). A Gaussian with its first and second moments is fitted
+    on a plane by least squares.
     """
     taken = 1 - image / light
     out = []
@@ -147,9 +146,8 @@ def test_map_is_as_accurate_as_documented(interpolation, limit):
 @pytest.mark.parametrize('interpolation, order', [('linear', 1), ('cubic', 3)])
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_against_scipy(dtype, interpolation, order):
-    """map_coordinates at the same sources gives the same image within 1/64 px of its slope.
-
-    Its cubic is a spline through the pixels, OpenCV's a convolution: they agree on a smooth image.
+    """map_coordinates at the same sources gives the same image within 1/64 px of its slope. Its
+    cubic is a spline through the pixels, OpenCV's a convolution: they agree on a smooth image.
     """
     image = random_image(dtype)
     this = corrector(interpolation)

@@ -70,9 +70,8 @@ def test_same_seed_gives_the_same_numbers():
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_the_sources_are_where_the_documentation_says(seed):
-    """They are about 1.5 m from the middle and 2 m apart, and look at the middle.
-
-    The image is upright: v points down the z axis of the rig.
+    """They are about 1.5 m from the middle, which they look at, and 2 m apart. The image is
+    upright: v points down the z axis of the rig.
     """
     a, b = virtual_rig(seed).fluoroscopes
     assert (a.name, b.name) == ('a', 'b')

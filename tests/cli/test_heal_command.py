@@ -62,7 +62,7 @@ def heal(rig, recording, out, *more):
 
 
 def assert_same_but_for_larger_sd(parent, healed):
-    """Check that both folders correct alike and only deviations of the healed one are larger."""
+    """Check that corrections are the same; unseen changes make the later deviations larger."""
     ids = load_orientation(healed / 'rig_orientation.npz').calibration_ids
     before, after = (load_calibrations(folder) for folder in (parent, healed))
     assert ids == tuple(after[name].calibration_id for name in 'ab')

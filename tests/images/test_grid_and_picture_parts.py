@@ -344,7 +344,7 @@ def test_markers_of_a_body_without_pose_are_doubted_where_no_other_view_supports
         Fake(view=0, tracker=tracker, doubt=lambda rows, frame: doubted.append(rows.tolist()))
     ]
     joined._target_id = np.arange(1, 8)
-    # Of the unplaced markers, 3 and 7 belong to the second body and the others to other bodies.
+    # Markers 3 and 7 belong to the second body, all others to other bodies.
     second = np.array([0, 0, 1, 0, 0, 0, 1], dtype=bool)
     joined._again = [Fake(target_id=np.array([3, 7]))] if once else []
     agree = np.array([[0, 0, 0, 0, 1, 0, 0]], dtype=bool)

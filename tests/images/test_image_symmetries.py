@@ -130,7 +130,7 @@ def test_field_of_view_turns_with_the_image():
     outer = (u - 120) ** 2 + (v - 90) ** 2 < 84**2
     assert field[inner].all() and not field[~outer].any()
     transposed = field_of_view(np.ascontiguousarray(lit.T), 2.0)
-    assert np.mean(transposed != field.T) < 0.005  # the elliptic kernel is not quite round
+    assert np.mean(transposed != field.T) < 0.005  # an ellipse of pixels is not quite round
     assert np.mean(field_of_view(lit[::-1].copy(), 2.0) != field[::-1]) < 0.005
     np.testing.assert_array_equal(field_of_view(7 * lit, 2.0), field)
 
@@ -212,7 +212,7 @@ def test_an_image_says_itself_whether_its_markers_are_bright():
 
 @pytest.mark.parametrize('is_bright', [False, True])
 def test_markers_are_told_from_noise_that_is_stronger_where_there_is_less_light(is_bright):
-    """Inverting the image turns the light of bright markers into that of dark ones."""
+    """The light of bright markers is the largest grey value minus that of dark markers."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     light = np.full(SHAPE, 57000.0)
     for x, y in PLACES:

@@ -139,7 +139,7 @@ def test_image_file(one, corrector, tmp_path, capfd, ending, dtype):
 
 
 def test_the_suffix_decides_the_format(one, corrector, tmp_path):
-    """Every format can be converted; jpg has a small loss."""
+    """A bmp image is written in every format; jpg has a small loss."""
     (tmp_path / 'in.bmp').write_bytes(encode(image_of(), '.bmp'))
     for ending in IMAGE_SUFFIXES:
         out = tmp_path / f'out{ending}'

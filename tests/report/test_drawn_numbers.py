@@ -618,7 +618,7 @@ def test_figure_of_points_shows_when_each_was_found_and_its_sd():
 
 
 def test_points_are_in_the_path_of_their_target():
-    """A frame with another first target keeps the order of the paths."""
+    """A point is in the path of its target even if its frame has another first target."""
     every = [frame(n, [True, True, True], n) for n in (1, 2, 3)]
     late = every[1]
     late.target_id, late.points = late.target_id[1:], frame(2, [True, True], 2).points

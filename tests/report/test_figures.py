@@ -110,7 +110,7 @@ def drawn(panel):
 
 
 def test_poses_are_drawn_over_time_with_two_standard_deviations():
-    """Rotations are relative to the first pose, in degrees; times without a pose are grey."""
+    """Rotations are relative to the first pose, in degrees; times without a marker are grey."""
     femur, tibia = motion()
     figure = body_figure(tibia)
     panels = figure.axes

@@ -48,7 +48,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def without_pictures(monkeypatch):
-    """Draw pictures without rendering them."""
+    """Do not render pictures, but draw them."""
     monkeypatch.setattr(html_report, 'svg_text', lambda figure: '')
 
 

@@ -56,7 +56,7 @@ def plain(scene):
 
 @pytest.fixture
 def without_pixels(monkeypatch):
-    """Draw figures without rendering them, which takes most of the time."""
+    """Do not render the figures, which takes most of the time."""
     monkeypatch.setattr(report_figures, 'png_bytes', lambda figure: b'pixels')
 
 

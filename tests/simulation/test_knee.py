@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The virtual knee: its files agree with its motion, which is realistic."""
+"""The virtual knee: its files agree with its motion, and its motion with that of people."""
 
 import csv
 

@@ -140,7 +140,7 @@ def test_the_phantom_is_a_cube_of_503_beads_with_a_survey(seed):
 @pytest.mark.parametrize('seed', range(20))
 def test_distortion_is_large_at_the_edge_and_small_in_the_middle(seed):
     """14 to 17 px along the edge and 26 to 35 px in the corners; smooth, and proportional to its
-    strength.
+    strength, down to none.
     """
     field = random_field(np.random.default_rng(seed))
     size = np.linalg.norm(field(GRID), axis=1)

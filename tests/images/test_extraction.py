@@ -154,7 +154,7 @@ def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
 
 
 def test_a_shadow_that_a_larger_one_hides_is_less_sure():
-    """Its error is that by both radii where the edge is hidden; the larger bead hardly moves."""
+    """Errors of both radii move it where its edge is hidden; the larger bead hardly moves."""
     profile = Profile(6.0, 1.0, 0.6, 0.0)
     size = np.array([1.0, 2.0])
     uv = np.array([[40.2, 40.4], [50.6, 40.9]])

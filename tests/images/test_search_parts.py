@@ -500,7 +500,7 @@ def test_a_marker_moves_by_the_larger_one_of_its_coordinates():
 
 
 def test_response_to_a_shadow_is_the_smaller_eigenvalue_of_the_hessian():
-    """Rows where two separately filtered parts meet are included."""
+    """The tested rows include those where two separately filtered parts meet."""
     width = 4096
     image = np.random.default_rng(6).uniform(0, 100, (24, width)).astype(np.float32)
     assert PIXELS_AT_ONCE // width == 16

@@ -42,11 +42,11 @@ def orientation(views=2, covariance=None, step_deg=60.0):
 
 @dataclass(frozen=True)
 class Noise:
-    """Of image points: random, and by the correction; the latter is given, or drawn."""
+    """Noise of image points: standard deviations of the random part and of the correction."""
 
     px: float = 0.2
     correction_px: float = 0.0
-    shift: np.ndarray | None = None  # (F, n, 2), error of the correction
+    shift: np.ndarray | None = None  # (F, n, 2), error of the correction [px]; None for no error
 
 
 def project(rig, points, errors=None):
@@ -62,7 +62,7 @@ def project(rig, points, errors=None):
 
 
 def exposure(rig, ids, uv, noise, reject=4.0):
-    """IntersectedViews of image points (F, n, 2), NaN where one is not seen."""
+    """Return IntersectedViews of image points (F, n, 2); NaN marks points that are not seen."""
     total = np.full(len(ids), np.hypot(noise.px, noise.correction_px))
     views = [
         CorrectedView(
@@ -78,14 +78,14 @@ def exposure(rig, ids, uv, noise, reject=4.0):
 
 
 def observed(rig, ids, points, rng, noise=Noise(), errors=None):
-    """IntersectedViews of points (n, 3) with noise."""
+    """Return IntersectedViews of the noisy projections of points (n, 3)."""
     uv = project(rig, points, errors)
     shift = np.zeros_like(uv) if noise.shift is None else noise.shift
     return exposure(rig, ids, uv + shift + rng.normal(0, noise.px, uv.shape), noise)
 
 
 def body(rng, markers=4, name='femur', first=1, sd=0.0, half=15.0):
-    """A body with markers in a cube about a point off its origin, and not near a line."""
+    """Return a body with markers in a cube away from its origin; they are not nearly collinear."""
     across = 0.0
     while across < half:
         xyz = rng.uniform(-half, half, (markers, 3)) + [80.0, 0.0, 40.0]

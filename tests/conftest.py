@@ -16,41 +16,41 @@ except ImportError:  # without the plugin, one process runs all tests
     LoadFileScheduling = None
 
 
-# Before numpy is imported: workers share the cores, and threads of linear algebra would only wait
-# for each other.
+# Set this before numpy is imported: the workers share the cores, and linear algebra threads
+# would only wait for each other.
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
 
-# Many tests start commands; without bytecode on disk each compiles what it loads.
+# Many tests start commands; without cached bytecode each command compiles what it imports.
 os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
 sys.dont_write_bytecode = False
 
-# A third of the time to load the tests is that of the collector, and little of it is garbage.
+# The collector takes a third of the time to load the tests and finds little garbage.
 gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage again, but not that of the tests and modules, which stay."""
+    """Re-enable garbage collection, but exempt the tests and modules, which stay in memory."""
     gc.freeze()
     gc.enable()
 
 
 def pytest_sessionfinish() -> None:
-    """Let pytest, which collects five times at its end, look at what is left once."""
+    """Collect garbage once: pytest collects five times at its end and then has little to do."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope='session', autouse=True)
 def ports(tmp_path_factory):
-    """Reserve ports before any test makes a node: Fast DDS reads its profile once."""
+    """Reserve ports before any test creates a node: Fast DDS reads its profile only once."""
     with own_ports(tmp_path_factory.mktemp('dds')):
         yield
 
 
 ROS = ('tests/ros 1', 'tests/ros 2')
-# Files whose tests share the calibrations of tests/rigs.py or tests/turning_rig.py, so that one
-# worker makes them once.
+# Files whose tests share the calibrations of tests/rigs.py or tests/turning_rig.py: they run in
+# the same worker, so that each calibration is computed once.
 SHARING = (
     'tests/estimation/test_calibration.py',
     'tests/estimation/test_self_calibration.py',
@@ -105,7 +105,7 @@ if LoadFileScheduling is not None:
             return ROS[self._files_of_ros.index(name) % len(ROS)]
 
         def _assign_work_unit(self, node) -> None:
-            """Begin with what takes longest."""
+            """Start with the scopes that take longest."""
             for scope in reversed((*ROS, SHARING[0], *LENGTHY)):
                 if scope in self.workqueue:
                     self.workqueue.move_to_end(scope, last=False)
@@ -113,20 +113,20 @@ if LoadFileScheduling is not None:
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_xdist_make_scheduler(config, log):
-        """Distribute by file unless another distribution is asked for."""
+        """Return the scheduler above, unless a distribution other than by file is requested."""
         if config.getvalue('dist') == 'loadfile':
             return TwoWorkersForRos(config, log)
         return None
 
 
-LOWER_PRIORITY = 10  # as that of the calibration jobs of the nodes
-_seen = set()  # what this worker has run: 'ros', 'others'
+LOWER_PRIORITY = 10  # niceness increment, the same as for the calibration jobs of the nodes
+_seen = set()  # kinds of tests that this worker has run: 'ros', 'others'
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Let the worker with ROS nodes go first: streams and jobs must not starve beside it.
+    """Give the worker with ROS nodes priority: other tests must not starve its streams and jobs.
 
-    The nodes inherit the priority of their worker, so the one that begins with them keeps its own.
+    Nodes inherit the priority of their worker, so a worker that starts with them keeps its own.
     """
     kind = 'ros' if item.nodeid.startswith('tests/ros/') else 'others'
     if kind == 'others' and not _seen and hasattr(item.config, 'workerinput'):

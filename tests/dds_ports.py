@@ -27,11 +27,11 @@ PROFILE = """\
 
 @contextlib.contextmanager
 def own_ports(directory):
-    """Let all ROS processes of this session use ports of Fast DDS that are not those of another.
+    """Give all ROS processes of this session Fast DDS ports that no other session uses.
 
-    Each participant has a port of its own in the 400 below the base, in whatever domain it is.
-    Another session that takes the port of a participant that has just ended may lose it: Fast DDS
-    removes ports in shared memory at the end of a process, and those that it takes for broken ones
+    Each participant has a port of its own in the 400 below the base, whatever its domain.
+    If another session took over the port of a participant that has just ended, it could lose it:
+    a process that ends removes its ports in shared memory, and also ports that it considers broken
     (https://github.com/eProsima/Fast-DDS/issues/6117).
     """
     base, lock = _free_base()
@@ -45,7 +45,7 @@ def own_ports(directory):
 
 def _free_base():
     """Return the port that Fast DDS counts from, and the open lock file that reserves it."""
-    for base in range(7000, 3000, -410):  # 7400, the default, is that of a rig beside the tests
+    for base in range(7000, 3000, -410):  # not 7400, the default of a rig nearby
         try:
             return base, _locked(f'ports_{base}')
         except OSError:
@@ -54,7 +54,7 @@ def _free_base():
 
 
 def domains_with_stale_ports(base):
-    """Return the ROS domains of which processes have left ports in shared memory."""
+    """Return the ROS domains whose processes have left ports in shared memory."""
     names = os.listdir('/dev/shm')
     ports = (name.removeprefix('fastrtps_port') for name in names)
     return {(int(port) - base) // 250 for port in ports if port.isdecimal()}
@@ -66,8 +66,8 @@ _next_domain = itertools.count(os.getpid())
 def free_domain():
     """Return an unused ROS domain of this machine, and the open lock file that reserves it.
 
-    The domain used last comes up again last, and behind all others one in which a killed process
-    has left ports in shared memory: Fast DDS may take them for broken ones, and messages are lost.
+    The last used domain comes up last, and those in which a killed process left ports in shared
+    memory after all others: Fast DDS may take these ports for broken, and messages are lost.
     """
     base = int(os.environ[BASE])
     first = next(_next_domain)
@@ -82,7 +82,7 @@ def free_domain():
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
                 port.bind(
                     ('', base + 250 * domain + 10)
-                )  # any other first participant of the domain
+                )  # the bind fails if the domain has a first participant
             return domain, lock
         except OSError:
             lock.close()
@@ -90,7 +90,7 @@ def free_domain():
 
 
 def _locked(name):
-    """Return the open lock file of a name; OSError where another session has it."""
+    """Open and lock the lock file of a name; raise OSError if another session holds the lock."""
     path = Path(tempfile.gettempdir()) / f'fluoro_calib_test_{name}.lock'
     lock = open(path, 'a')  # noqa: SIM115 the lock is held by the caller
     try:

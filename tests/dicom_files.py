@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""DICOM files as machines write them."""
+"""DICOM files as X-ray machines write them."""
 
 import pydicom
 
@@ -9,7 +9,7 @@ LITTLE = '1.2.840.10008.1.2.1'
 
 
 def dicom(path, frames, rle=False, **changes):
-    """A DICOM file by pydicom; changes replace elements."""
+    """Return a DICOM file written by pydicom; `changes` replace elements."""
     bits = 8 if frames.max() < 256 else 12
     meta = pydicom.dataset.FileMetaDataset()
     meta.TransferSyntaxUID = changes.pop('syntax', LITTLE)

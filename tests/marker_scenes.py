@@ -58,7 +58,7 @@ def small_rig(names: Sequence[str] = 'ab', between_deg: float = BETWEEN_DEG) -> 
 
 
 def covered(of: MarkerImage, rows: slice | Sequence[int]) -> np.ndarray:
-    """An image without some of the markers."""
+    """Return the image with some of its markers painted over."""
     rng = np.random.default_rng(3)
     light = of.image.astype(np.float32)
     noise = np.median(np.abs(light - cv2.GaussianBlur(light, (0, 0), 3))) / 0.6745
@@ -72,7 +72,7 @@ def covered(of: MarkerImage, rows: slice | Sequence[int]) -> np.ndarray:
     return np.clip(plain, 0, 65535).astype(np.uint16)
 
 
-# A rig of three fluoroscopes, and two bodies that move in front of it.
+# A rig of three fluoroscopes, with two bodies moving in front of it.
 
 THREE = 'abc'
 FRAMES = 24
@@ -86,7 +86,7 @@ def rig() -> VirtualRig:
 
 @cache
 def sequence() -> tuple[dict[str, MarkerImage], ...]:
-    """Images of all exposures by fluoroscope."""
+    """Return the images of all exposures, each keyed by fluoroscope."""
     settings = replace(MARKER_SETTINGS, round_field=False)
     images = MarkerSequence(rig(), MovingMarkers(SCENE, SEED), settings, FRAMES, SEED)
     return tuple(dict(of) for of in images)
@@ -98,7 +98,7 @@ def ids() -> np.ndarray:
 
 @cache
 def calibration() -> tuple[dict[str, FluoroscopeCalibration], RigOrientation]:
-    """The true calibrations, and the orientation."""
+    """Return the true calibrations and the true orientation."""
     calibrations = {
         name: replace(each, image_size=(SIZE, SIZE))
         for name, each in rigs.true_calibrations(rig().fluoroscopes, 0.05).items()

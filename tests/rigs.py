@@ -36,9 +36,9 @@ from fluoro_calib_ros.simulation.rig import (
 
 @contextlib.contextmanager
 def refused(kind, **numbers):
-    """Context in which a DataError of a kind is raised, in one line; it holds the findings.
+    """Check that a DataError of a kind is raised with a one-line message; yield the caught error.
 
-    numbers are those that the first finding of the kind must have.
+    numbers: values that the first finding of this kind must have.
     """
     with pytest.raises(DataError) as caught:
         yield caught
@@ -49,15 +49,15 @@ def refused(kind, **numbers):
 
 
 def kinds(findings):
-    """Kinds of findings, in their order."""
+    """Return the kinds of findings, in order."""
     return [found.kind for found in findings]
 
 
 def adjusted(noise_px, **rmse):
-    """Return what checks take of an adjustment of frames of two points: result, calibrations,
+    """Return what checks take of an adjustment of frames of two points each: result, calibrations,
     frames.
 
-    noise_px: of the calibrations. rmse: {fluoroscope: (before, after)} of its residuals [px].
+    noise_px: noise of the calibrations. rmse: {fluoroscope: (before, after)} of residuals [px].
     """
     names = [*rmse]
     frames = {
@@ -92,7 +92,7 @@ def rig():
 
 @functools.cache
 def exposures(count=15, seed=1):
-    """{fluoroscope: [Frame, ...]} of the rig; cached, so do not modify them."""
+    """Return {fluoroscope: [Frame, ...]} of the rig; cached, so do not modify the frames."""
     return simulate_exposures(rig(), count, seed).frames
 
 
@@ -107,12 +107,12 @@ def _calibrated(name, count, options):
 
 
 def short_calibration():
-    """A calibration of fluoroscope a that takes a fraction of a second; many tests share it."""
+    """Return a quickly computed calibration of fluoroscope a; many tests share it."""
     return calibrated('a', 6, max_iterations=2).calibrations['a']
 
 
 def true_calibrations(fluoroscopes, image_sd=0.25):
-    """True calibrations by name of the fluoroscopes of a rig without distortion."""
+    """Return true calibrations by name for the fluoroscopes of a rig without distortion."""
     one = short_calibration()
     return {
         f.name: replace(
@@ -129,7 +129,7 @@ def true_calibrations(fluoroscopes, image_sd=0.25):
 
 
 def true_orientation(fluoroscopes, calibrations):
-    """True orientation of fluoroscopes with these calibrations by name, a small covariance."""
+    """Return the true orientation of calibrated fluoroscopes, with a small covariance."""
     sd = np.tile([0.03] * 3 + [2e-5] * 3 + [0.1] * 3, len(fluoroscopes))
     return RigOrientation(
         tuple(f.name for f in fluoroscopes),
@@ -145,7 +145,7 @@ def true_orientation(fluoroscopes, calibrations):
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Options of small_network: noise, survey, free interiors and share of seen targets."""
+    """Options of small_network: noise, survey, free interiors, fraction of targets seen."""
 
     noise_px: float = 0.3
     nu: float = np.inf
@@ -155,7 +155,7 @@ class NetworkOptions:
 
 
 def small_network(exposures=4, targets=30, fluoroscopes=1, seed=0, **options):
-    """Network and true Parameters: targets in a box of 200 mm, partly seen in each exposure."""
+    """Return a Network and true Parameters: targets in a 200 mm box, seen partly per exposure."""
     options = NetworkOptions(**options)
     rng = np.random.default_rng(seed)
     true_mm = rng.uniform(-100, 100, (targets, 3))
@@ -189,7 +189,7 @@ def small_network(exposures=4, targets=30, fluoroscopes=1, seed=0, **options):
 
 
 def disturbed(parameters, seed=0, degrees=0.5, mm=5.0):
-    """Start values with errors in rotations, positions, points and interior orientations."""
+    """Return initial values: rotations, positions, points and interiors with errors."""
     rng = np.random.default_rng(seed)
     turn = matrix_from_vector(rng.normal(0, np.deg2rad(degrees), parameters.position_mm.shape))
     interior = parameters.interior + rng.normal(0, 5.0, parameters.interior.shape)
@@ -202,7 +202,7 @@ def disturbed(parameters, seed=0, degrees=0.5, mm=5.0):
 
 
 def moved(network, parameters, x):
-    """Parameters moved by a vector (u,) of T and w of the exposures, points and free interiors."""
+    """Return parameters moved by x (u,): T and w of the exposures, points, free interiors."""
     m, n = network.n_exposures, network.n_points
     exterior = x[: 6 * m].reshape(m, 6)
     points = x[6 * m : 6 * m + 3 * n].reshape(n, 3)
@@ -217,7 +217,7 @@ def moved(network, parameters, x):
 
 
 def design_matrix(network, parameters):
-    """Dense derivatives (2N, u) of the image points, in the order of `moved`."""
+    """Return the dense derivatives (2N, u) of the image points, in the order of `moved`."""
     count = network.n_image_points
     m, n = network.n_exposures, network.n_points
     _, d_e, d_p, d_i = project_with_jacobian(*network.per_image_point(parameters))
@@ -233,7 +233,7 @@ def design_matrix(network, parameters):
 
 
 def dense_normal_matrix(network, adjustment, factor=1.0):
-    """Dense normal matrix (u, u) of an adjustment; factor of its image weights."""
+    """Return the dense normal matrix (u, u), with the image weights multiplied by factor."""
     a = design_matrix(network, adjustment.parameters)
     weight = (
         factor
@@ -248,7 +248,7 @@ def dense_normal_matrix(network, adjustment, factor=1.0):
 
 
 def run(*arguments):
-    """Exit status of the command fluoro-calib, in this process."""
+    """Run the command fluoro-calib in this process and return its exit status."""
     try:
         main([str(a) for a in arguments])
     except SystemExit as stop:
@@ -257,7 +257,7 @@ def run(*arguments):
 
 
 def pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCalibration:
-    """Return a calibration for images of any size: a pincushion of some pixels."""
+    """Return a calibration for images of any size: a pincushion distortion of some pixels."""
     places = np.meshgrid(*(np.linspace(-0.5, s - 0.5, 12) for s in image_size))
     uv = np.stack(places, axis=-1).reshape(-1, 2)
     x = (uv - 0.5 * np.array(image_size)) / (max(image_size) / 2)
@@ -274,7 +274,7 @@ def pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCalibration
 
 
 def smooth_pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCalibration:
-    """Return `pincushion` with a cubic, whose lookup grid is made in a tenth of the time."""
+    """Return `pincushion` as a cubic, whose lookup grid takes a tenth of the time to make."""
     calibration = pincushion(name, image_size)
     functions = Functions(image_size, 3)
     radial = [((3, 0), (1, 2)), ((2, 1), (0, 3))]  # x r^2 and y r^2
@@ -288,9 +288,9 @@ def smooth_pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCali
 def turning(
     calibration: FluoroscopeCalibration, degrees: float = 60.0, size_px: float = 1.0
 ) -> FluoroscopeCalibration:
-    """Return a calibration whose correction also changes with an angle, as of a C-arm.
+    """Return a calibration whose correction also changes with an angle, as for a C-arm.
 
-    Calibrated are angles of up to +-degrees; size_px: of the coefficients of each harmonic.
+    The calibrated angles are up to +-degrees; size_px: deviation of coefficients per harmonic.
     """
     rng = np.random.default_rng(5)
     field = AngleField(

@@ -32,7 +32,7 @@ class Disk:
         subprocess.run(['umount', '--lazy', self.path], check=True)
 
     def leave(self, free_kb):
-        """Fill the disk up to so many kB."""
+        """Fill the disk until this many kB are free."""
         (self.path / 'filling').unlink(missing_ok=True)
         found = os.statvfs(self.path)
         with open(self.path / 'filling', 'wb') as file:
@@ -42,7 +42,7 @@ class Disk:
         self._mount('-o', 'remount,ro', self.path)
 
     def contents(self):
-        """Bytes of all files, hidden ones too, but of the filling."""
+        """Return the bytes of all files, including hidden ones but not the filling."""
         return {
             str(p.relative_to(self.path)): p.read_bytes()
             for p in self.path.rglob('*')

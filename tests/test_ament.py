@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The linters of ament where they are installed, and their rules without them.
+"""The linters of ament if they are installed, and otherwise their rules.
 
-flake8's rules are ruff's, which tests/test_lint.py runs; package.xml follows REP 149.
+flake8 has the rules of ruff, see tests/test_lint.py; package.xml follows REP 149.
 """
 
 import importlib.util
@@ -18,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (ROOT, ROOT / 'msg_defs')
-# What pyproject.toml ignores: a summary may take two lines, may be a noun, and begins as it is.
+# As in pyproject.toml: a summary may take two lines, be a noun, and start in lower case.
 PEP257 = ['D101', 'D102', 'D103', 'D105', 'D107', 'D205', 'D400', 'D401', 'D403']
 PYTHON = subprocess.run(
     ['git', 'ls-files', '*.py'], cwd=ROOT, capture_output=True, text=True, check=True
@@ -35,7 +35,7 @@ PYTHON = subprocess.run(
     ids=lambda value: value if isinstance(value, str) else '',
 )
 def test_ament_linter_is_content(linter, arguments):
-    """In a process: the linters parse sys.argv and keep state."""
+    """Run each linter in a process of its own: the linters parse sys.argv and keep state."""
     if importlib.util.find_spec(linter) is None:
         pytest.skip(f'{linter} is not installed')
     if linter == 'ament_xmllint' and not shutil.which('xmllint'):
@@ -49,7 +49,7 @@ def test_ament_linter_is_content(linter, arguments):
     assert not done.returncode, (done.stdout + done.stderr)[-3000:]
 
 
-# ---- the same without ament
+# ---- the same rules without ament
 
 
 DEPENDENCIES = (
@@ -65,8 +65,8 @@ DEPENDENCIES = (
     'replace',
 )
 GROUPS = ('group_depend', 'member_of_group')
-# Elements of package_format3.xsd: groups in their order, those within a group in any order; and
-# how many there must and may be.
+# Elements of package_format3.xsd with their least and greatest number. Groups come in this
+# order; the elements within a group may come in any order.
 ELEMENTS = (
     (('name',), 1, 1),
     (('version',), 1, 1),
@@ -91,7 +91,7 @@ ATTRIBUTES = {
 
 @pytest.fixture(params=PACKAGES, ids=lambda path: path.name)
 def package(request):
-    """Folder and root element of a package.xml."""
+    """Return the folder and the root element of a package.xml."""
     return request.param, ElementTree.parse(request.param / 'package.xml').getroot()
 
 

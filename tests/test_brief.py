@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Results in a console: short, whatever their arrays contain."""
+"""Representations of results in a console are short, whatever their arrays contain."""
 
 from dataclasses import fields, is_dataclass
 
@@ -27,7 +27,7 @@ def test_arrays_are_shown_by_their_shape_and_scalars_as_they_are():
 
 
 def test_no_result_of_the_api_shows_its_arrays():
-    """A dataclass writes all of its fields, a reconstruction some four million characters."""
+    """The default repr of a dataclass shows all fields: some four million characters here."""
     for name in dir(fc):
         kind = getattr(fc, name)
         if is_dataclass(kind) and any('rray' in str(field.type) for field in fields(kind)):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The documentation: links lead somewhere, generated sections are replaced between marks."""
+"""The documentation: links resolve, and generated sections are replaced between their marks."""
 
 import re
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_pages_that_sources_name_exist():
 
 
 def test_picture_of_the_rooms_shows_those_that_there_are():
-    """From the top down, as the import contract orders them; entry_points only names others."""
+    """The order is that of the import contract, without entry_points, which only names others."""
     layers = re.search(r'^layers = \[(.*?)^\]', (ROOT / 'pyproject.toml').read_text(), re.M | re.S)
     rooms = re.findall(r'\w+', layers[1])
     picture = (ROOT / 'docs/images/architecture.svg').read_text()

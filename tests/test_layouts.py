@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Layouts of Foxglove and PlotJuggler: what they show is published."""
+"""Layouts of Foxglove and PlotJuggler: everything that they show is published."""
 
 import json
 import re
@@ -14,7 +14,7 @@ MESSAGES = {'calibration_status': 'CalibrationStatus', 'drift': 'DriftStatus'}
 
 
 def assert_published(topic, field):
-    """Check a topic against docs/nodes.md, and a field against its message."""
+    """Check that docs/nodes.md lists the topic and that its message has the field."""
     relative = re.sub('^/[ab]/', '<f>/', topic).lstrip('/')
     assert f'| `{relative}` |' in NODES or f'| `/{relative}` |' in NODES, topic
     if field:

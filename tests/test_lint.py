@@ -17,7 +17,7 @@ SOURCES = sorted((ROOT / 'fluoro_calib_ros').rglob('*.py'))
 
 
 def run(*command):
-    """Run Python with the arguments of a command; returns its exit status and output."""
+    """Run Python with the given arguments and return its exit status and output."""
     done = subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True)
     return done.returncode, done.stdout + done.stderr
 
@@ -37,9 +37,9 @@ def test_linter_is_content(command):
 
 @pytest.mark.long
 def test_types_are_right():
-    """Without the garbage collector, which takes a sixth of mypy's time and finds little.
+    """Run mypy without garbage collection, which takes a sixth of its time and finds little.
 
-    With mypy's cache, so that only the first run after a change of all files takes a minute.
+    mypy's cache is used, so that only the first run after a change of all files takes a minute.
     """
     code = (
         'import gc; gc.disable(); gc.enable = gc.disable; '
@@ -50,7 +50,7 @@ def test_types_are_right():
 
 
 def test_imports_keep_their_contracts():
-    """No import runs up or in a circle, and only the nodes know ROS; see pyproject.toml."""
+    """No import runs upwards or in a circle, and only the nodes use ROS; see pyproject.toml."""
     code = (
         'from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))'
     )
@@ -75,9 +75,9 @@ def test_every_source_names_its_licence_itself():
 
 @functools.cache
 def nodes():
-    """Pairs of a path and a syntax node: functions, classes, assignments, calls of the package."""
+    """Return pairs of a path and a syntax node: functions, classes, assignments and calls."""
     kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Assign, ast.Call)
-    gc.disable()  # it would look through all trees again and again, and find nothing
+    gc.disable()  # it would traverse all syntax trees again and again without finding anything
     try:
         return [
             (name, node)
@@ -116,7 +116,7 @@ def test_parallel_assignments_are_rare():
 
 
 def is_of_library(call):
-    """Whether a call is one of a library that takes positional arguments only."""
+    """Return whether a call belongs to a library that takes positional arguments only."""
     target = call.func
     while isinstance(target, ast.Attribute):
         target = target.value
@@ -124,7 +124,7 @@ def is_of_library(call):
 
 
 def test_sources_keep_their_sizes():
-    """A node fits 400 lines, a class 300, a function 75; no call has six positional arguments."""
+    """At most 400 lines a node, 300 a class, 75 a function; five positional arguments a call."""
     too_large = []
     for path in SOURCES:
         lines = path.read_text().count('\n')

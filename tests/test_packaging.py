@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The two packages, their metadata and the set-up agree with each other."""
+"""The two packages, their metadata and their set-up files agree with each other."""
 
 import configparser
 import fnmatch
@@ -25,9 +25,7 @@ INTERFACES = sorted(
 
 
 def package_xml(folder):
-    """Return the text of the fields of a package.xml that both packages share, and its
-    dependencies.
-    """
+    """Return the fields of a package.xml that both packages share, and its dependencies."""
     root = ElementTree.parse(folder / 'package.xml').getroot()
     fields = {tag: root.findtext(tag) for tag in ('name', 'version', 'license', 'maintainer')}
     fields['email'] = root.find('maintainer').get('email')
@@ -56,7 +54,7 @@ def test_metadata_agrees():
 
 
 def test_scripts_are_installed_where_ros2_run_looks():
-    """On a colcon install the scripts go into lib/<package>."""
+    """A colcon install puts the scripts into lib/<package>."""
     config = configparser.ConfigParser()
     config.read(ROOT / 'setup.cfg')
     assert (
@@ -80,7 +78,7 @@ def test_console_scripts_exist(entry):
 
 
 def test_every_interface_is_built():
-    """CMakeLists.txt lists just the interface files that are there."""
+    """CMakeLists.txt lists exactly the interface files that exist."""
     listed = re.findall(
         r'"((?:msg|srv|action)/\w+\.\w+)"', (MSG_DEFS / 'CMakeLists.txt').read_text()
     )
@@ -89,7 +87,7 @@ def test_every_interface_is_built():
 
 @pytest.mark.parametrize('path', INTERFACES, ids=lambda path: path.name)
 def test_every_message_field_is_documented(path):
-    """Every field and constant has a comment, and every number in it a unit."""
+    """Every field and constant has a comment, and every numeric one states a unit."""
     for number, line in enumerate(path.read_text().splitlines(), 1):
         field, _, comment = line.partition('#')
         if field.strip() in ('', '---'):
@@ -106,7 +104,7 @@ def test_every_message_field_is_documented(path):
 
 
 def test_messages_without_ros():
-    """The bag writer reads the message definitions from the package, without ROS."""
+    """The bag writer reads the message definitions from the package, so it needs no ROS."""
     folder = ROOT / 'fluoro_calib_ros' / 'io' / 'bags' / 'msg'
     assert sorted(path.name for path in folder.glob('*.msg')) == sorted(
         path.name for path in INTERFACES if path.suffix == '.msg'
@@ -114,8 +112,8 @@ def test_messages_without_ros():
 
 
 def test_lock_is_exact():
-    """The lock file pins every package to one version and its files to their hashes, and contains
-    all of requirements.in.
+    """The lock file pins every package to one version and its files to hashes, and contains all of
+    requirements.in.
     """
     text = (ROOT / 'requirements.lock').read_text()
     pins = re.findall(r'^[^\s#].*(?:\n    .*)*', text, re.MULTILINE)
@@ -131,8 +129,8 @@ def test_lock_is_exact():
 
 
 def project_files():
-    """Paths of the files of the project: those git knows, in an unpacked archive all but what is
-    made here.
+    """Return the paths of the project's files: those that git lists or, in an unpacked archive,
+    all files that .gitignore does not name.
     """
     listing = subprocess.run(
         ['git', 'ls-files', '--cached', '--others', '--exclude-standard', '-z'],
@@ -181,7 +179,7 @@ def test_no_machine_paths():
     ],
 )
 def test_node_without_a_module_says_what_to_install(node, blocked, said):
-    """One sentence and exit status 1, no traceback."""
+    """A missing module gives one sentence and exit status 1, but no traceback."""
     code = (
         f'import sys; sys.modules[{blocked!r}] = None; '
         f'from fluoro_calib_ros.entry_points import {node}; {node}()'
@@ -197,7 +195,7 @@ def test_node_without_a_module_says_what_to_install(node, blocked, said):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_node_that_is_interrupted_during_its_import_ends_with_status_0(tmp_path, number):
-    """The import of rclpy, which comes first, waits here."""
+    """The import of rclpy comes first; here a substitute module waits during it."""
     (tmp_path / 'rclpy.py').write_text('import time\nprint(flush=True)\ntime.sleep(60)\n')
     code = 'from fluoro_calib_ros.entry_points import correction_node; correction_node()'
     with subprocess.Popen(

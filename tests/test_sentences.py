@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sentence of every kind of finding, once: all other tests assert kinds and numbers.
+"""The sentence of every kind of finding, tested once; all other tests assert kinds and numbers.
 
-# stands for a number.
+In the expected sentences, # stands for a number.
 """
 
 import functools
@@ -77,7 +77,7 @@ def _body(name, xyz=CORNERS):
 
 
 def shape(change=lambda given: given, moves=0.0):
-    """The first finding about a body whose CT is changed, or whose marker 0 moves [mm]."""
+    """Return the first finding on a body with a changed CT, or with a marker 0 that moves [mm]."""
     rng = np.random.default_rng(0)
     places = CORNERS + rng.normal(0, 100, (50, 1, 3)) + rng.normal(0, 0.02, (50, 5, 3))
     places[:, 0] += rng.normal(0, 1, (50, 3)) * moves
@@ -97,7 +97,7 @@ def frames(count=4):
 
 @functools.cache
 def checks():
-    """The checks of a verdict by kind, failed."""
+    """Return the checks of a verdict by kind, all of them failed."""
     few = [replace(f, target_id=f.target_id[::2], uv=f.uv[::2]) for f in frames(8)]
     request = CalibrationRequest({'a': few}, PHANTOM, FAST)
     job = calibrate(request.frames, PHANTOM, FAST)
@@ -132,7 +132,7 @@ def no_validation():
 
 
 def excluded(kind, spoil):
-    """The finding of a kind on the first exposure, spoilt."""
+    """Return the finding of a kind on the first exposure, which `spoil` has changed."""
     first, *others = frames(5)
     found = measured_network({'a': [spoil(first), *others]}, PHANTOM).excluded
     return next(one for one in found if one.kind is kind)
@@ -167,14 +167,14 @@ def raised(call, *arguments):
 
 
 def phantom_with(count, place):
-    """The phantom with the targets that are seen first at another place."""
+    """Return the phantom with `count` targets of the first exposure moved to another place."""
     xyz = PHANTOM.xyz_mm.copy()
     xyz[PHANTOM.index(np.unique(frames()[0].target_id)[:count])] = place
     return Phantom(PHANTOM.target_id, xyz, PHANTOM.sd_mm)
 
 
 def pairs(**changes):
-    """How pairs of exposures scatter."""
+    """Return the scatter of pairs of exposures."""
     k = 8
     return Fake(
         **{
@@ -209,14 +209,14 @@ def moved_rig():
 
 
 def trial(kind):
-    """What a trial of the reconstruction says is confused."""
+    """Return the finding on missing rays for the confusion that a trial reconstruction reports."""
     both = {name: list(of_one[:2]) for name, of_one in exposures().items()}
     found = [why for why, _ in epipolar._trials(both, 'ab', {1, 2})]
     return epipolar.missing_rays(0.9, next(one for one in found if one.kind is kind))
 
 
 def bead(**changes):
-    """Why a predicted bead is not observed."""
+    """Return why a predicted bead is not observed."""
     beads = {
         'uv': 0.0,
         'depth': 1.0,
@@ -347,20 +347,20 @@ HEALED = Fake(orientation=Fake(fluoroscopes=('a', 'b')), bodies=())
 
 
 def changed_rig(cause):
-    """Diagnosis of a rig with a changed fluoroscope a, or perhaps a moved b."""
+    """Return a diagnosis: fluoroscope a has changed or, as the rival, b has moved."""
     rival = Change(Cause.ORIENTATION, fluoroscope=1)
     changes = (Change(cause, fluoroscope=0),)
     return Fake(changes=changes, probability=(0.7,), rivals=(rival,), complete=True)
 
 
 def changed(cause):
-    """Finding about fluoroscope a."""
+    """Return the finding about fluoroscope a."""
     diagnosis = changed_rig(cause)
     return healing._finding(diagnosis.changes[0], HEALED, diagnosis)
 
 
 def unsure_cause():
-    """Check of a diagnosis with a rival."""
+    """Return the check of a diagnosis with a rival."""
     return healing._sure(changed_rig(Cause.INTERIOR), HEALED)
 
 
@@ -911,7 +911,7 @@ SENTENCES = {
 
 
 def pattern(sentence):
-    """Regular expression of a sentence, with numbers and places of an image."""
+    """Return the regular expression of a sentence; # is a number and @ a place in an image."""
     return re.escape(sentence).replace(r'\#', NUMBER).replace('@', '[a-z ]+')
 
 
@@ -936,7 +936,7 @@ def test_places_in_a_sentence():
 
 
 def test_an_error_keeps_its_findings_on_its_way():
-    """Through a process, and with a place in front."""
+    """It is passed through a process pipe, and a place is put in front."""
     given = Finding(Kind.POOR_FIT, 'cause', Place(('a',)), numbers={'residual_px': 9.0})
     here, there = multiprocessing.Pipe()
     there.send(DataError(given, 'line\nend'))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Exposures of the virtual rig whose distortion turns with a C-arm."""
+"""Exposures of the virtual rig with a distortion that turns with a C-arm."""
 
 import functools
 from dataclasses import replace
@@ -15,7 +15,7 @@ CHANGE_PX = 2.0
 
 
 def turned(uv, angle, size):
-    """Change (n, 2) [px] of the distortion at pixels uv (n, 2) with an angle."""
+    """Return the change (n, 2) [px] of the distortion with an angle, at pixels uv (n, 2)."""
     x, y = ((uv - (np.asarray(size) - 1) / 2) / (max(size) / 2)).T
     spiral = (x * x + y * y)[:, None] * np.column_stack([-y, x])
     bend = np.column_stack([x * x, -y * y]) * y[:, None]
@@ -23,8 +23,8 @@ def turned(uv, angle, size):
 
 
 def recording(known=True):
-    """Frames of 22 exposures at angles, 14 for the calibration and 8 for the test."""
-    return _recording(known)  # a cache tells a default from the same value
+    """Return frames of 22 exposures at angles: 14 for the calibration and 8 for the test."""
+    return _recording(known)  # a cached function would treat f() and f(True) differently
 
 
 @functools.cache
@@ -49,7 +49,7 @@ def _recording(known):
 
 
 def turning(known=True):
-    """Calibration of these exposures."""
+    """Return the calibration of these exposures."""
     return _turning(known)
 
 

@@ -64,7 +64,7 @@ def test_poses_and_joints_with_their_deviations(knee, tmp_path, capsys):
     for name in ('angle_1_deg', 'angle_2_deg', 'angle_3_deg'):
         error = np.array([float(a[name]) - float(b[name]) for a, b in zip(found, true)])
         sd = np.array([float(a[f'sd_{name}']) for a in found])
-        # CT coordinates with 0.1 mm turn an anatomical frame by 0.2 degrees, in all exposures.
+        # An error of 0.1 mm in CT coordinates turns an anatomical frame by 0.2 degrees throughout.
         assert np.abs(error).max() < 4 * sd.max() < 2.0
         assert np.std(error) < 0.2
     assert {row['status'] for row in found} == {'OK'}
@@ -115,7 +115,7 @@ def test_report_of_joints_and_bodies_needs_nothing_else(knee, tmp_path):
 
 
 def test_neutral_position_of_another_recording(knee, tmp_path, capsys):
-    """The same recording as its own neutral trial: the mean rotation becomes zero."""
+    """A recording that is its own neutral trial has a mean rotation of zero."""
     text = (knee / 'joints.toml').read_text()
     whole = text.replace('[joint.proximal_frame', 'neutral = [1, 60]\n\n[joint.proximal_frame', 1)
     (tmp_path / 'whole.toml').write_text(whole)
@@ -134,7 +134,7 @@ def test_neutral_position_of_another_recording(knee, tmp_path, capsys):
 
 
 def test_film_has_the_markers_where_they_were_observed(knee, tmp_path, monkeypatch):
-    """In the radiographs as they are, with their distortion."""
+    """Markers are drawn in the radiographs as recorded, including their distortion."""
     shown = (1, 30, 31)
     for name in 'ab':
         (tmp_path / 'images' / name).mkdir(parents=True)

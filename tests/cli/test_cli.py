@@ -30,7 +30,7 @@ EXPOSURES = 6
 
 
 def command(*arguments, **options):
-    """The command as a process of its own."""
+    """Run the command in a process of its own."""
     return subprocess.run(
         [sys.executable, '-m', 'fluoro_calib_ros.cli', *map(str, arguments)],
         cwd=ROOT,
@@ -42,7 +42,7 @@ def command(*arguments, **options):
 
 
 def files_of(folder):
-    """{path: content} of all files below a folder."""
+    """Return {path: content} of all files below a folder."""
     return {
         str(p.relative_to(folder)): p.read_bytes()
         for p in sorted(pathlib.Path(folder).rglob('*'))
@@ -52,7 +52,7 @@ def files_of(folder):
 
 @pytest.fixture(scope='module')
 def rig(tmp_path_factory):
-    """A data set of the virtual rig, with exposures for a test."""
+    """A data set of the virtual rig, including exposures for a test."""
     folder = tmp_path_factory.mktemp('rig')
     more = ('--exposures', EXPOSURES, '--test-exposures', 5, '--seconds', 0.05)
     assert run('simulate', '--out', folder, *more) == 0
@@ -61,7 +61,7 @@ def rig(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def result(rig, tmp_path_factory):
-    """The folder that a short calibration of both fluoroscopes has written."""
+    """The folder written by a short calibration of both fluoroscopes."""
     folder = tmp_path_factory.mktemp('calibrated') / 'result'
     assert (
         run(
@@ -86,9 +86,7 @@ def calibrate(rig, out, *more, source='calibration', phantom='phantom.csv'):
 
 
 def said(capsys, arguments, status=1):
-    """The one sentence on standard error with which a command fails; nothing is on standard
-    output.
-    """
+    """Return the one sentence with which a command fails; nothing is on standard output."""
     assert run(*arguments) == status
     out, err = capsys.readouterr()
     assert out == '' and 'Traceback' not in err
@@ -105,7 +103,7 @@ def said(capsys, arguments, status=1):
 
 
 def test_simulate_is_reproducible(tmp_path):
-    """Of every file; another seed gives others."""
+    """All files are the same for the same seed and different for another seed."""
     for name, seed in (('one', 5), ('other', 5), ('third', 6)):
         assert (
             run(
@@ -144,7 +142,7 @@ def test_simulate_is_reproducible(tmp_path):
 
 @pytest.mark.long
 def test_sample_bags_were_made_by_the_documented_command(tmp_path):
-    """fluoro-calib simulate --out bags: file by file what is in bags/."""
+    """The folder bags/ is, file by file, what fluoro-calib simulate --out bags writes."""
     assert 'fluoro-calib simulate --out bags' in (ROOT / 'bags' / 'README.md').read_text()
     assert run('simulate', '--out', tmp_path) == 0
     made = files_of(tmp_path)
@@ -164,11 +162,11 @@ def test_simulate_has_any_number_of_fluoroscopes(tmp_path):
     rig = json.loads((tmp_path / 'truth' / 'rig.json').read_text())
     sources = np.array([one['position_mm'] for one in rig['fluoroscopes'].values()])
     between = np.degrees(np.arccos(1 - pdist(sources, 'cosine')))
-    assert between[[0, 2]] == pytest.approx(60, abs=6)  # of neighbours
+    assert between[[0, 2]] == pytest.approx(60, abs=6)  # angle between neighbours
 
 
 def test_size_of_one_part_does_not_change_the_others(tmp_path, rig):
-    """The exposures for the calibration are those without a test."""
+    """The exposures for the calibration are the same with and without a test."""
     assert run('simulate', '--out', tmp_path, '--exposures', EXPOSURES) == 0
     assert (tmp_path / 'calibration.csv').read_bytes() == (rig / 'calibration.csv').read_bytes()
     assert not (tmp_path / 'test').exists()
@@ -252,7 +250,7 @@ def test_calibrate_writes_result_and_calibrations(result):
 
 @pytest.mark.long
 def test_bag_and_csv_give_the_same_numbers(rig, tmp_path):
-    """To the last digit, also in a process of its own with two threads."""
+    """They agree to the last digit, also in another process with two threads."""
     more = ('--max-iterations', 1, '--fluoroscopes', 'a', '--model', 'local_linear')
     assert run(*calibrate(rig, tmp_path / 'bag', *more)) == 0
     assert run(*calibrate(rig, tmp_path / 'csv', *more, *IMAGE, source='calibration.csv')) == 0
@@ -276,7 +274,7 @@ def test_bag_and_csv_give_the_same_numbers(rig, tmp_path):
 
 @pytest.mark.long
 def test_json_is_the_only_standard_output(rig, tmp_path, capfd):
-    """What result.json says; nothing on standard error, of libraries either."""
+    """It has the content of result.json; libraries write nothing to standard error either."""
     more = ('--json', '--max-iterations', 1, '--fluoroscopes', 'b', '--model', 'none')
     assert run(*calibrate(rig, tmp_path, *more)) == 0
     out, err = capfd.readouterr()
@@ -353,7 +351,7 @@ def test_adjust_holds_the_calibration(rig, result, tmp_path):
     for name, figures in document['fluoroscopes'].items():
         held = before['fluoroscopes'][name]['interior']
         assert {**figures['interior'], 'sd': 0} == {**held, 'sd': 0}
-        # Held, but as uncertain as it is.
+        # The interior is fixed, but it keeps its uncertainty.
         assert np.allclose(figures['interior']['sd'], held['sd'], rtol=0.05)
         assert max(figures['rmse_px']['after']) < 0.35 < 1 < min(figures['rmse_px']['before'])
         assert (tmp_path / f'{name}.calibration.npz').read_bytes() == (
@@ -383,9 +381,9 @@ def test_correct_removes_the_distortion(rig, result, tmp_path, capsys):
         corrected = np.array([[float(r['u_corrected']), float(r['v_corrected'])] for _, r in mine])
         np.testing.assert_allclose(
             corrected, uv - calibration.model.predict(uv), atol=0.01
-        )  # the lookup grid's
+        )  # tolerance of the lookup grid
         assert all(g == {key: r[key] for key in g} for g, r in mine)
-        if name == 'a':  # another grid takes a second
+        if name == 'a':  # for one fluoroscope only: making another grid takes a second
             wanted = calibration.correct(uv)
             assert np.array_equal(corrected, wanted.uv)
             assert [r['status'] == 'OUTSIDE' for _, r in mine] == (
@@ -444,7 +442,7 @@ def test_every_command_has_help_with_an_example_that_parses(command, capsys):
 
 
 def test_help_is_short_and_help_all_whole(capsys):
-    """What few need is named by its group, and required arguments are never hidden."""
+    """Rarely used options are named by their group only; required arguments are never hidden."""
     from fluoro_calib_ros.cli import RARE, make_parser
 
     texts = {}
@@ -492,7 +490,7 @@ def test_missing_files_are_reported_by_name(rig, tmp_path, capsys):
 
 @pytest.mark.long
 def test_failing_process_prints_one_sentence(rig, tmp_path):
-    """Status 1, and no traceback, whatever the process prints else."""
+    """The exit status is 1 and there is no traceback, whatever else the process prints."""
     done = command(*calibrate(rig, tmp_path / 'x', source='nowhere'))
     assert (done.returncode, done.stdout) == (1, '') and done.stderr.count('\n') == 1
     assert done.stderr.startswith('fluoro-calib calibrate: ') and 'nowhere' in done.stderr
@@ -625,8 +623,8 @@ def test_frames_of_another_image_size_are_refused(rig, result, tmp_path, capsys)
 
 @pytest.mark.long
 def test_failing_command_leaves_earlier_results(rig, result, tmp_path, capsys):
-    """Byte for byte: a calibration that fails at its second fluoroscope, an adjustment, a
-    correction.
+    """The commands that fail are a calibration at its second fluoroscope, an adjustment and a
+    correction; the results stay the same byte for byte.
     """
     before = files_of(result)
     lines = (rig / 'calibration.csv').read_text().splitlines()
@@ -670,7 +668,7 @@ def test_impossible_output_is_reported(rig, tmp_path, capsys):
 
 
 def test_exposures_that_are_left_out_are_reported(rig, tmp_path, capsys):
-    """On standard error and in the result; the calibration goes on."""
+    """Excluded exposures appear on standard error and in the result; the calibration goes on."""
     lines = (rig / 'calibration.csv').read_text().splitlines()
     third = [n for n, line in enumerate(lines) if line.startswith('a,3,')]
     kept = [
@@ -714,7 +712,7 @@ def test_calibrate_ends_with_verdict_and_report(rig, tmp_path, capsys):
 
 
 def numbers_of(command):
-    """Arguments of a command that take one number."""
+    """Yield the arguments of a command that take one number."""
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     for action in parser._actions:
@@ -724,7 +722,7 @@ def numbers_of(command):
 
 @pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.NAME)
 def test_numbers_of_a_command_have_a_range(command):
-    """Each takes an ordinary number and its own default; neither NaN nor what is far off."""
+    """Each accepts an ordinary number and its own default, but neither NaN nor absurd numbers."""
     for action in numbers_of(command):
 
         def is_taken(text, action=action):
@@ -736,7 +734,7 @@ def test_numbers_of_a_command_have_a_range(command):
 
         assert any(map(is_taken, ('0.5', '1', '5', '100', '4000'))), action.dest
         assert not any(map(is_taken, ('nan', 'x', '-1e30', '1e30'))), action.dest
-        if action.default:  # 0 stands for what is not given
+        if action.default:  # a default of 0 means that no value is given
             assert is_taken(str(action.default)), action.dest
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What commands decide, print and pass on, with outcomes that are given."""
+"""What commands decide, print and pass on, for outcomes that are given."""
 
 import argparse
 import io
@@ -35,7 +35,7 @@ from fluoro_calib_ros.jobs.scheduling import Cluster
 
 
 class Wrong(Exception):
-    """What a parser does with a wrong argument."""
+    """Raised instead of the exit of a parser on a wrong argument."""
 
 
 def wrong(message):
@@ -230,7 +230,7 @@ def test_clusters_of_reconstruct_need_the_drift_watch_of_a_bag(
     assert [body.name for body in given.bodies] == ['tibia'] * len(clusters)
 
 
-# ---- what is printed
+# ---- printed output
 
 
 class Terminal(io.StringIO):
@@ -456,7 +456,7 @@ def test_changes_of_a_healed_rig_are_told_with_their_units():
 
 
 def healing(changed=(), drift=(), verdict='pass', meanwhile=False, causes=(), **more):
-    """Outcome of healing two fluoroscopes; changed: numbers of those that stand otherwise."""
+    """Return the outcome of healing two fluoroscopes; `changed`: indices of those that moved."""
     changes, sd = np.zeros((2, 9)), np.full((2, 9), 0.5)
     changes[list(changed), 0] = 2.0
     healed = Fake(changes=changes, sd=sd, drift=dict.fromkeys(drift))

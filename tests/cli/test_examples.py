@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The examples run, and the public interface is what they import."""
+"""The examples run, and they import exactly the public interface."""
 
 import contextlib
 import io
@@ -26,7 +26,7 @@ EXAMPLES = ROOT / 'examples'
 
 @pytest.fixture(scope='module')
 def place(tmp_path_factory):
-    """Folder with bags/ in which examples run; its bag for the calibration is a short one."""
+    """Folder with bags/ in which examples run; its calibration bag is a short one."""
     folder = tmp_path_factory.mktemp('examples')
     bags = folder / 'bags'
     bags.mkdir()
@@ -38,7 +38,7 @@ def place(tmp_path_factory):
 
 
 def example(name, *arguments, place=ROOT):
-    """Run an example as a program, in a folder with bags/; returns what it prints."""
+    """Run an example as a program in a folder with bags/ and return what it prints."""
     said = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
         patch.chdir(place)

@@ -45,7 +45,7 @@ def beads() -> np.ndarray:
 
 @cache
 def picture(number: int, dtype: type = np.uint8) -> tuple[np.ndarray, np.ndarray]:
-    """An image of another renderer than that of the benchmark, and the true centres."""
+    """Return an image from a renderer other than that of the benchmark, and the true centres."""
     rotation = matrix_from_vector([0.3 * number, 0.2, -0.1 * number])
     x = beads() @ rotation.T + (0, 0, 900)
     uv = 1600 * x[:, :2] / x[:, 2:] + (SIZE - 1) / 2
@@ -81,11 +81,11 @@ def extract(folder: Path, source: str, *more: str) -> None:
     )
 
 
-FEW = 30  # beads of which all poses are searched in a short time
+FEW = 30  # number of beads; few enough that all poses are searched in a short time
 
 
 def few_shown() -> np.ndarray:
-    """An image of few of the beads."""
+    """Return an image of a few of the beads."""
     return bead_image(picture(1)[1][:FEW], (SIZE, SIZE), np.uint8, 2.0, 0.6, 0.01, 1)
 
 
@@ -94,7 +94,7 @@ def few(xyz_mm: np.ndarray) -> Phantom:
 
 
 def shown_once(folder: Path, image: np.ndarray) -> None:
-    """Replace the images by one and two without shadows, which are refused at once."""
+    """Write the image as the first one; the other two show no shadows and are refused at once."""
     cv2.imwrite(str(folder / 'a' / 'image_0001.png'), np.ascontiguousarray(image))
     for number in (2, 3):
         cv2.imwrite(str(folder / 'a' / f'image_{number:04d}.png'), np.full_like(image, 200))
@@ -178,7 +178,7 @@ def test_images_without_the_phantom_give_one_sentence(folder, capsys, image, sen
 
 
 def moved(frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image of a video: the phantom turns and shifts between them."""
+    """Return a frame of a video of a phantom that turns and shifts, and the true centres."""
     rotation = matrix_from_vector([0.3, 0.2 + 0.01 * frame, -0.1])
     x = beads() @ rotation.T + (2.0 * frame - 10, 0, 900)
     uv = 1600 * x[:, :2] / x[:, 2:] + (SIZE - 1) / 2
@@ -242,7 +242,7 @@ def test_images_of_one_fluoroscope_need_its_name(folder, capsys):
 
 
 def test_python_calibrates_from_images(folder, tmp_path_factory):
-    """A folder with a folder for each fluoroscope, beside nothing else; image n of m is told."""
+    """The source only has one folder for each fluoroscope; progress is reported by image."""
     images = tmp_path_factory.mktemp('images')
     (folder / 'a').rename(images / 'a')
     for number in (4, 5, 6):
@@ -305,7 +305,7 @@ def test_images_of_a_bag_are_read(folder):
 
 
 def test_rendered_markers_are_followed(tmp_path, capsys):
-    """`simulate --marker-images` gives images, first places and the truth for `extract`."""
+    """`simulate --marker-images` writes the images, first places and truth for `extract`."""
     rig = tmp_path / 'rig'
     options = ('--exposures', '1', '--seconds', '0', '--marker-images', '2')
     assert not main(['simulate', '--out', str(rig), *options])
@@ -327,7 +327,7 @@ def test_rendered_markers_are_followed(tmp_path, capsys):
 
 
 def image_bag(path: Path, numbers: tuple[int, ...] = (1, 2, 3)) -> Path:
-    """A bag with images of fluoroscope a, and states of a joint until the second of them."""
+    """Write a bag with images of fluoroscope a, and joint states up to the second image."""
     time = message_class('builtin_interfaces/msg/Time')
     header = message_class('std_msgs/msg/Header')
     with BagWriter(path) as bag:
@@ -379,7 +379,7 @@ def test_images_of_files_have_the_angle_that_is_given(folder, capsys):
 
 
 def test_calibrate_takes_the_angles_of_images_in_a_bag(folder, monkeypatch):
-    monkeypatch.setattr(os, 'cpu_count', lambda: 1)  # images are searched in this process
+    monkeypatch.setattr(os, 'cpu_count', lambda: 1)  # search the images in this process
     bag = image_bag(folder / 'bag')
     survey = read_survey(folder / 'phantom.csv')
     angles = ImageAngles(AngleOptions('carm', 5.0))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""fluoro-calib heal: a virtual rig is bumped, and calibrated anew from a walking knee."""
+"""fluoro-calib heal: a virtual rig is bumped, then recalibrated from a walking knee."""
 
 import json
 import shutil
@@ -62,7 +62,7 @@ def heal(rig, recording, out, *more):
 
 
 def assert_same_but_for_larger_sd(parent, healed):
-    """Calibrations of folders correct to the same bytes; the later ones claim what is not seen."""
+    """Check that corrections are the same; unseen changes make the later deviations larger."""
     ids = load_orientation(healed / 'rig_orientation.npz').calibration_ids
     before, after = (load_calibrations(folder) for folder in (parent, healed))
     assert ids == tuple(after[name].calibration_id for name in 'ab')
@@ -88,7 +88,7 @@ def test_bumped_rig_is_healed_and_its_points_are_right_again(rig, tmp_path, caps
     after = load_orientation(healed / 'rig_orientation.npz')
     assert document['parent_orientation_id'] == before.orientation_id
     assert document['orientation_id'] == after.orientation_id and after.source == 'healing'
-    # Nothing but the orientation of b has changed: corrections are the same.
+    # Only the orientation of b has changed: the corrections are the same.
     assert_same_but_for_larger_sd(rig / 'result', healed)
     assert document['common_motion']['numbers']['distance_mm'] > 0.05
     learned = read_learned_shapes(healed)

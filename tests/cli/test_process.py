@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""fluoro-calib process: a study of trials, done once, resumed, and judged trial by trial."""
+"""fluoro-calib process: a study of trials is done once, resumed, and judged trial by trial."""
 
 import contextlib
 import csv
@@ -40,7 +40,7 @@ def write_study(folder, text):
 
 @pytest.fixture(scope='module')
 def rig(tmp_path_factory):
-    """A rig, calibrated from its bag, and two trials: image points of ten exposures each."""
+    """A rig calibrated from its bag, for two trials with image points of ten exposures each."""
     folder = tmp_path_factory.mktemp('study') / 'rig'
     more = ('--exposures', 6, '--test-exposures', 10, '--seconds', 0.05)
     assert run('simulate', '--out', folder, *more) == 0
@@ -52,7 +52,7 @@ def rig(tmp_path_factory):
 
 @pytest.fixture
 def study(rig, tmp_path):
-    """A study of two trials with a calibration that nobody has validated."""
+    """A study of two trials whose calibration has not been validated."""
     folder = write_study(tmp_path / 'study', STUDY.replace('drift_watch = false\n', ''))
     shutil.copytree(rig / 'result', folder / 'result')
     (folder / 'trials').mkdir()
@@ -62,7 +62,7 @@ def study(rig, tmp_path):
 
 
 class Forked:
-    """A command in a fork of this process, in the place of a program that loads all modules."""
+    """Run a command in a fork of this process instead of a program that loads all modules."""
 
     def __init__(self, command, stdout, stderr, start_new_session):
         assert command[1:3] == ['-m', 'fluoro_calib_ros.cli'] and start_new_session
@@ -107,7 +107,7 @@ def rows_of(study):
 
 
 def changed_by(study, *more):
-    """The files that a run of the study has written anew, and its exit status."""
+    """Run the study; return the result files that this run wrote, and its exit status."""
     results = study / 'results'
     before = {p: p.stat().st_mtime_ns for p in results.rglob('*') if p.is_file()}
     status = run('process', study, '--workers', 2, *more)
@@ -122,7 +122,7 @@ def test_trials_are_processed_once_and_again_where_something_changed(study, fork
     everything = {
         f'trials/{name}/points.{kind}' for name in ('walk', 'run') for kind in ('csv', 'trc')
     }
-    assert changed_by(study) == (everything, 3)  # nobody has validated the calibration
+    assert changed_by(study) == (everything, 3)  # status 3: the calibration has not been validated
     for row in rows_of(study).values():
         assert row['verdict'] == 'cannot tell' and row['frames'] == '10'
         assert 0 < int(row['points_ok']) < int(row['points'])
@@ -157,11 +157,11 @@ def test_a_trial_that_fails_does_not_stop_the_others(study, capsys, forked):
     assert not (study / 'results/trials/walk/points.trc').exists()
     shutil.copy(study / 'trials' / 'run.csv', study / 'trials' / 'walk.csv')
     walk = {'trials/walk/points.csv', 'trials/walk/points.trc'}
-    assert changed_by(study) == (walk, 3)  # what has failed is tried again
+    assert changed_by(study) == (walk, 3)  # the failed trial is tried again
 
 
 def test_a_trial_of_a_rig_that_has_moved_fails(study, forked):
-    """As one that was recorded after a knock: the rays of its points miss each other."""
+    """The trial looks as if recorded after a knock: the rays of its points miss each other."""
     path = study / 'trials' / 'walk.csv'
     with open(path, newline='') as file:
         rows = list(csv.DictReader(file))
@@ -197,7 +197,7 @@ def test_trials_of_a_calibration_that_failed_are_not_processed(study, capsys):
 
 @pytest.mark.long
 def test_calibration_and_trials_from_one_file(tmp_path, capsys):
-    """Of a rig without distortion, so that little is to be estimated."""
+    """The rig has no distortion, so that there is little to estimate."""
     rig = tmp_path / 'rig'
     more = ('--exposures', 6, '--test-exposures', 10, '--seconds', 0.05, '--strength', 0)
     assert run('simulate', '--out', rig, *more) == 0

@@ -57,7 +57,7 @@ def test_rig_file_makes_flags_unnecessary(rig, tmp_path):
     assert parsed(['orient', 'capture'], content).calibration == tmp_path / 'result'
     assert (arguments.units, arguments.phantom_sd) == ('cm', 0.05)
     out = ['convert', 'result', '--to', 'mayacam2', '--out', 'cameras']
-    assert parsed(out, content).units is None  # which would be that of its output
+    assert parsed(out, content).units is None  # units would apply to its output
     flags = ['calibrate', 'points.csv', '--out', 'x', '--fluoroscopes', 'c']
     arguments = parsed(flags, content)
     assert arguments.out == Path('x') and arguments.fluoroscopes == ['c']
@@ -88,7 +88,7 @@ def test_joints_of_the_rig_give_the_angle_in_every_command_that_reads_a_bag(rig,
     words = [command, *READ_A_BAG[command]]
     options = angle_options(parsed(words, content))
     assert options.joints(['a', 'b']) == {'a': 'frontal', 'b': 'lateral'}
-    assert options.joints(['a']) == {'a': 'frontal'}  # a recording of one of them
+    assert options.joints(['a']) == {'a': 'frontal'}  # a recording of one of the fluoroscopes
     assert options.angle_max_age == 2.0
     assert angle_options(parsed([*words, '--angle-max-age', '3'], content)).angle_max_age == 3.0
     assert angle_options(parsed(words)).angle_max_age == 0.5

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Signals end a command, whatever it does at that moment."""
+"""Signals end a command, whatever it is doing at that moment."""
 
 import signal
 import subprocess

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The commands of docs/tutorial.md, as they stand there."""
+"""The commands of docs/tutorial.md run exactly as written there."""
 
 import csv
 import re
@@ -21,7 +21,7 @@ RIG = re.search('```toml\n(.*?)```', TEXT, re.S)[1]
 
 @pytest.mark.long
 def test_commands_of_the_tutorial(tmp_path, monkeypatch, capsys):
-    """From XMALab's tables to points; validate and report take time, and have their own tests."""
+    """From XMALab's tables to points; validate and report are slow and have their own tests."""
     monkeypatch.chdir(tmp_path)
     assert len(COMMANDS) == 14
     for command in COMMANDS:
@@ -31,7 +31,7 @@ def test_commands_of_the_tutorial(tmp_path, monkeypatch, capsys):
         if command[0] not in ('validate', 'report'):
             main(command)
         if command[0] in ('calibrate', 'adjust', 'orient'):
-            assert 'change it with' not in capsys.readouterr().err  # rig.toml says unit and sd
+            assert 'change it with' not in capsys.readouterr().err  # rig.toml states unit and sd
     assert 'marker' in Path('walk_undistorted.csv').read_text()
     assert Path('points.png').stat().st_size and Path('points.c3d').stat().st_size
     assert len(list(Path('mayacam').iterdir())) == 2
@@ -45,7 +45,7 @@ def test_commands_of_the_tutorial(tmp_path, monkeypatch, capsys):
         np.array([[float(rows[key][axis]) for axis in axes] for key in keys])
         for rows, axes in ((found, 'xyz'), (truth, ('x_mm', 'y_mm', 'z_mm')))
     )
-    # Distances do not depend on the frame, which is that of exposure 1 here.
+    # Compare distances: they do not depend on the frame, here that of exposure 1.
     first = [k for k, key in enumerate(keys) if key[0] == keys[0][0]]
     apart = [
         np.linalg.norm(points[first][:, None] - points[first][None], axis=2)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Figures of the demonstration, of results whose errors are known."""
+"""Figures of the demonstration, for results whose errors are known."""
 
 import json
 import re
@@ -23,7 +23,7 @@ FRAMES = range(1, 31)
 
 @pytest.fixture(scope='module')
 def truth():
-    """Markers by (frame, target), and the true rig."""
+    """Return the markers by (frame, target) and the true rig."""
     rig = json.loads((BAGS / 'truth' / 'rig.json').read_text())['fluoroscopes']
     return assessment._true_markers(BAGS), rig
 
@@ -75,7 +75,7 @@ def test_image_errors_are_what_no_projective_map_explains(truth):
         for name, noise in (('a', 0.5), ('b', 0.1)):
             ideal = assessment._ideal_projection(rig[name], xyz)
             observed = ideal + rng.normal(0, 5 * noise, ideal.shape)
-            # Another sensor plane: a calibration is known up to that. Errors are of the true one.
+            # The sensor plane of a calibration may be any; errors refer to the true plane.
             turned = 1.5 * ideal @ [[1.02, 0.03], [-0.02, 0.97]] + [12.0, -7.0]
             turned = turned / (1 + turned @ [[2e-5], [-1e-5]])
             turned += rng.normal(0, 1.5 * noise, ideal.shape)
@@ -117,7 +117,7 @@ def test_live_angles_are_compared_with_those_of_the_same_frame(tmp_path):
     live._knee = virtual_knee(1)
     live._truth = landing(live._knee, np.arange(40) / 40)
     off = np.radians([1.0, -2.0, 0.5])
-    sd = np.append(np.radians([0.5, 1.0, 0.25]), [1e-3] * 3)  # [rad] and [m]
+    sd = np.append(np.radians([0.5, 1.0, 0.25]), [1e-3] * 3)  # turns [rad], shifts [m]
     messages = [
         Fake(
             frame_number=number,
@@ -133,4 +133,4 @@ def test_live_angles_are_compared_with_those_of_the_same_frame(tmp_path):
     assert (tmp_path / 'knee.png').stat().st_size > 1000
     count, total, *figures = map(float, re.findall(r'\d+(?:\.\d+)?', line.partition('; pic')[0]))
     assert (count, total) == (3, 40)
-    assert figures == [1.0, 2.0, 0.5, 4.0]  # RMSE of each angle, squared error over its variance
+    assert figures == [1.0, 2.0, 0.5, 4.0]  # RMSE of each angle; squared error over variance

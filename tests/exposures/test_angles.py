@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Angle of the C-arm in an exposure: the last state of its joint, by stamps."""
+"""Angle of the C-arm in an exposure: the last joint state before it, by stamp."""
 
 import math
 import random
@@ -25,7 +25,7 @@ def track(states, **options):
 def test_angle_is_that_of_the_last_state_at_or_before_the_exposure():
     found = track([(S, 0.1), (2 * S, 0.2), (3 * S, 0.3)])
     assert found.at(2 * S) == found.at(2 * S + S // 4) == pytest.approx(0.2, abs=1e-8)
-    assert found.at(3 * S - 1) is None  # older than 0.5 s
+    assert found.at(3 * S - 1) is None  # the state of 2 s is older than 0.5 s
     assert found.at(S - 1) is None
     assert found.at(3 * S + S // 2) == pytest.approx(0.3, abs=1e-8)
     assert found.at(3 * S + S // 2 + 1) is None

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pairing of frames, collecting of still exposures, and coverage of the image."""
+"""Pairing of frames, collection of still exposures, and coverage of the image."""
 
 import itertools
 
@@ -43,7 +43,7 @@ def pair(number=1, stamp_ms=0.0, shift=0.0, shift_b=None):
 
 
 def completed(pairer, frame):
-    """The exposure that a frame completes, or None."""
+    """Return the exposure that a frame completes, or None."""
     exposures = pairer.add(frame)
     assert len(exposures) <= 1
     return exposures[0] if exposures else None
@@ -62,7 +62,7 @@ def test_frames_are_paired_by_number_in_any_order():
 
 
 def test_frames_are_paired_by_stamp_within_the_tolerance():
-    """The nearest partner; the pair is numbered anew, as the frames need not be numbered alike."""
+    """The nearest frame is paired; pairs get new numbers, as numbers of frames may differ."""
     pairer = CompletePairer('ab', PairingOptions('stamp', 0.002))
     for number, stamp in ((70, 0), (71, 3), (72, 50)):
         assert completed(pairer, frame('a', number, stamp)) is None
@@ -75,7 +75,7 @@ def test_frames_are_paired_by_stamp_within_the_tolerance():
 
 
 def test_number_of_waiting_frames_is_limited():
-    """A frame dropped without a partner is counted and not paired later."""
+    """A frame that is dropped without a partner is counted, and is not paired later."""
     pairer = CompletePairer('ab', PairingOptions(waiting=3))
     for number in range(1, 6):
         assert completed(pairer, frame('a', number)) is None
@@ -132,7 +132,7 @@ def test_displacement_is_the_median_of_common_targets():
 
 
 def test_exposures_are_collected_where_the_phantom_stands_still_in_a_new_pose():
-    """A stream of 50 frames a second: standing, moving, standing elsewhere, and back again."""
+    """A stream of 50 frames per second: standing, moving, standing elsewhere, and back again."""
     collector = ExposureCollector('ab')
     taken = []
     shifts = (
@@ -147,8 +147,8 @@ def test_exposures_are_collected_where_the_phantom_stands_still_in_a_new_pose():
         said.append(collector.offer(pair(number, 20.0 * number, shift)))
         if not said[-1]:
             taken.append(number)
-    # Frame 40 is the first at rest: taken 100 ms after it, and never again in a pose that is there
-    # already.
+    # Frame 40 is the first at rest. An exposure is taken 100 ms later, and none is taken in a pose
+    # that is already collected.
     assert taken == [1, 45], said
     assert [e['a'].number for e in collector.exposures] == taken
     assert said[10] == 'this pose of the phantom is already collected'
@@ -156,7 +156,7 @@ def test_exposures_are_collected_where_the_phantom_stands_still_in_a_new_pose():
 
 
 def test_movement_seen_by_one_fluoroscope_counts():
-    """Along the axis of the other: neither still nor the same pose."""
+    """The motion is along the axis of the other fluoroscope: neither still nor the same pose."""
     collector = ExposureCollector('ab')
     assert collector.offer(pair(1, 0)) == ''
     assert collector.offer(pair(2, 20, 0, 50)) == 'the phantom moves'
@@ -165,7 +165,7 @@ def test_movement_seen_by_one_fluoroscope_counts():
 
 
 def test_first_frame_of_a_stream_in_motion_is_not_kept():
-    """It looks like a single shot until the next frames come."""
+    """The first frame looks like a single shot until the next frames come."""
     collector = ExposureCollector('ab')
     for number in range(10):
         collector.offer(pair(number + 1, 20 * number, 3.0 * number))
@@ -191,7 +191,7 @@ def test_every_single_shot_in_a_new_pose_is_collected():
 
 
 def test_moving_phantom_after_a_gap_in_a_stream_is_not_collected():
-    """A busy machine loses frames of a stream; a frame after the gap is no single shot."""
+    """A busy machine loses frames of a stream; a frame after the gap is not a single shot."""
     collector = ExposureCollector('ab')
     taken = []
     times = [
@@ -200,10 +200,10 @@ def test_moving_phantom_after_a_gap_in_a_stream_is_not_collected():
     for number, time in enumerate(times, 1):
         if not collector.offer(
             pair(number, time, np.clip(time - 400, 0, 800) / 4)
-        ):  # moves from 400 ms to 1200 ms
+        ):  # the phantom moves from 400 ms to 1200 ms
             taken.append(time)
     assert taken == [0.0, 1300.0]
-    assert collector.offer(pair(90, 3000.0, 50)) == ''  # the stream is over
+    assert collector.offer(pair(90, 3000.0, 50)) == ''  # long after the end of the stream
 
 
 def test_add_requires_only_a_new_number():
@@ -275,7 +275,7 @@ def test_unpaired_frames_are_left_out_and_counted():
 
 @pytest.mark.parametrize(('gap_ms', 'count'), [(10, 0), (10_000, 2)])
 def test_two_frames_are_exposures_unless_they_are_a_stream(gap_ms, count):
-    """Within the time that the phantom has to be still, nobody moves it to another pose."""
+    """Nobody moves a phantom to another pose within the time for which it has to be still."""
     frames = {
         name: [frame(name, 1 + i, i * gap_ms, shift=50.0 * i) for i in range(2)] for name in 'ab'
     }
@@ -306,7 +306,7 @@ def test_coverage_grows_from_zero_to_the_whole_image():
 
 
 def test_an_image_point_covers_its_surroundings_within_the_image():
-    """Its cell of 32 x 32 and the eight around it: in a corner there are three."""
+    """It covers its cell of 32 x 32 and its eight neighbours, of which a corner has three."""
     middle = Coverage(SIZE)
     corner = Coverage(SIZE)
     far_corner = Coverage(SIZE)
@@ -324,7 +324,7 @@ def test_an_image_point_covers_its_surroundings_within_the_image():
     half.add(
         np.stack(np.meshgrid(np.arange(0, 480.0), np.arange(0, 800.0)), axis=2).reshape(-1, 2)
     )
-    assert half.fraction == pytest.approx(17 / 32)  # the left half and the column beside it
+    assert half.fraction == pytest.approx(17 / 32)  # the left half and the next column
 
 
 def test_coverage_by_fluoroscope():
@@ -333,11 +333,11 @@ def test_coverage_by_fluoroscope():
     assert collector.coverage['a'].fraction > collector.coverage['b'].fraction > 0
 
 
-# ---- what is missing to a calibration
+# ---- what a calibration still needs
 
 
 def points_within(radius, count=4000, seed=3):
-    """Image points in a circle around the middle of the image, as a part of its half height."""
+    """Return image points in a circle around the centre; radius: fraction of half the height."""
     rng = np.random.default_rng(seed)
     angle, distance = rng.uniform(0, 2 * np.pi, count), np.sqrt(rng.uniform(0, 1, count))
     reach = radius * distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -353,15 +353,15 @@ def test_empty_areas_are_named_the_emptiest_first():
     left = np.stack(np.meshgrid(np.arange(0, 600.0, 5), np.arange(0, 800.0, 5)), axis=2)
     coverage.add(left.reshape(-1, 2))
     found = readiness(15, coverage)
-    assert not found.ready and found.areas == (2, 5)  # the right column from the top
+    assert not found.ready and found.areas == (2, 5)  # the right column, from the top
     assert 'in the upper right corner and at the right edge' in found.advice
     assert readiness(10, coverage).advice.startswith('5 more, ')
-    assert not any(c.isdigit() for c in found.advice)  # enough exposures
+    assert not any(c.isdigit() for c in found.advice)  # there are enough exposures
 
 
 @pytest.mark.parametrize(('columns', 'missing'), [(29, (2, 5, 8)), (30, ())])
 def test_areas_are_named_below_85_percent(columns, missing):
-    """The last area has 11 of 32 columns; a point covers the column beside it, too."""
+    """The last area has 11 of 32 columns; a point also covers the neighbouring column."""
     coverage = Coverage(SIZE)
     width, height = np.array(SIZE) / 32
     u, v = np.meshgrid((np.arange(columns) + 0.5) * width, (np.arange(32) + 0.5) * height)
@@ -370,7 +370,7 @@ def test_areas_are_named_below_85_percent(columns, missing):
 
 
 def test_a_round_field_of_view_has_no_corners():
-    """Those of an image intensifier hold no bead, whatever is shown."""
+    """The corners of an image intensifier never show a bead."""
     whole = Coverage(SIZE)
     whole.add(points_within(1.0))
     assert whole.fraction < 0.9 <= whole.fraction_of_field and whole.is_round
@@ -378,7 +378,7 @@ def test_a_round_field_of_view_has_no_corners():
     assert found.ready and found.areas == () and 'not round' in found.advice
     assert not readiness(14, whole).ready
     small = Coverage(SIZE)
-    small.add(points_within(0.5))  # too little of the field to tell
+    small.add(points_within(0.5))  # too little of the field to recognise its shape
     assert not small.is_round and not readiness(15, small).ready
     corner = Coverage(SIZE)
     corner.add(np.vstack([points_within(1.0), [[2.0, 2.0]]]))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Repair by eye: doubtful ids and exposures in a table, and what a person decides on them."""
+"""Repair by eye: doubtful ids and exposures in a table, and a person's decisions on them."""
 
 import csv
 from dataclasses import replace
@@ -43,7 +43,7 @@ def test_points_are_left_out_and_renamed_and_exposures_left_out():
     decisions = [
         decision(1, 2),
         decision(2, 1, 3, last=3),
-        decision(2, 3, 1, last=3),  # exchanged
+        decision(2, 3, 1, last=3),  # exchanged ids
         decision(4),
     ]
     out, counts = decided(frames, decisions)
@@ -120,7 +120,7 @@ def test_a_wrong_row_is_named(tmp_path, row, cause):
 
 
 def with_exchanged(frames, number, one, two):
-    """Frames of a fluoroscope with two ids the wrong way round in an exposure."""
+    """Return the frames with two ids exchanged in one exposure."""
     out = []
     for each in frames:
         ids = each.target_id.copy()
@@ -132,7 +132,7 @@ def with_exchanged(frames, number, one, two):
 
 
 def test_exchanged_ids_are_found_with_the_right_ones_and_repaired(tmp_path):
-    """The whole way: calibrate, doubtful.csv, decisions in it, and calibrate again."""
+    """The whole procedure: calibrate, write doubtful.csv, decide in it, and calibrate again."""
     true = exposures()['a'][:6]
     ids = true[2].target_id
     far = int(np.argmax(np.linalg.norm(true[2].uv - true[2].uv[0], axis=1)))
@@ -169,7 +169,7 @@ def test_exchanged_ids_are_found_with_the_right_ones_and_repaired(tmp_path):
 
 
 def test_two_points_at_one_bead_do_not_both_get_its_id():
-    """One of them is left out: an exposure has a target once."""
+    """One of them is excluded: an exposure has a target only once."""
     true = exposures()['a'][:6]
     ids = true[2].target_id
     far = np.argsort(-np.linalg.norm(true[2].uv - true[2].uv[0], axis=1))

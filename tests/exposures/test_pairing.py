@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pairing of three fluoroscopes or more with missing views: exposures, their order, and counts."""
+"""Pairing of three or more fluoroscopes with missing views: exposures, their order, and counts."""
 
 import itertools
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ BY = ('frame_number', 'stamp')
 
 @dataclass(frozen=True)
 class Frame:
-    """What the pairing needs of a frame; row: number of its exposure."""
+    """The attributes of a frame that the pairing needs; row: number of its exposure."""
 
     fluoroscope: str
     number: int
@@ -35,7 +35,7 @@ def frame(name, row, first=1, jitter_ns=0):
 
 
 def streams(rng, names, count, loss, jitter_ms=0.9):
-    """{name: [Frame, ...]} of count exposures, each view lost with the probability loss."""
+    """Return {name: [Frame, ...]} of count exposures; each view is lost with probability loss."""
     return {
         name: [
             frame(name, row, 1, int(rng.uniform(0, jitter_ms) * MS))
@@ -47,9 +47,9 @@ def streams(rng, names, count, loss, jitter_ms=0.9):
 
 
 def merged(rng, of_each, most_behind=None):
-    """Frames of all streams in a random order that keeps that of each stream.
+    """Return the frames of all streams in a random order that keeps the order of each stream.
 
-    most_behind: largest lag of a stream in exposures.
+    most_behind: largest lag of a stream, in exposures.
     """
     left = {name: list(of_one) for name, of_one in of_each.items()}
     out = []
@@ -67,7 +67,7 @@ def merged(rng, of_each, most_behind=None):
 
 
 def expected(of_each, min_views=2):
-    """[(row, names)] of the exposures with enough views."""
+    """Return [(row, names)] of the exposures with enough views."""
     rows = sorted({f.row for of_one in of_each.values() for f in of_one})
     there = [
         (row, {name for name, of_one in of_each.items() if row in {f.row for f in of_one}})
@@ -77,7 +77,7 @@ def expected(of_each, min_views=2):
 
 
 def paired(pairer, frames, flush=True):
-    """[(row, names)] of the exposures of a pairer; checks that their views belong together."""
+    """Return [(row, names)] of the paired exposures; check that their views belong together."""
     exposures = [e for f in frames for e in pairer.add(f)]
     exposures += pairer.flush() if flush else ()
     assert all(
@@ -125,7 +125,7 @@ def test_random_losses_jitter_and_delays(seed):
 
 @pytest.mark.parametrize('seed', range(30))
 def test_delays_beyond_the_patience_only_cost_views(seed):
-    """Exposures in order, each at most once; every frame is used or counted."""
+    """Exposures are in order, each at most once; every frame is used or counted."""
     rng = np.random.default_rng(seed)
     waiting = int(rng.integers(1, 12))
     patience = int(rng.integers(1, 12))
@@ -159,7 +159,7 @@ def test_a_lost_view_is_certain_with_the_next_frame(by):
 
 @pytest.mark.parametrize('by', BY)
 def test_a_silent_fluoroscope_is_awaited_once_and_resumed(by):
-    """The others then go on at once; when it delivers again, its first frame is late."""
+    """The others then continue at once; when it delivers again, its first frame is late."""
     pairer = exposure_pairer('abc', PairingOptions(by, 0.001, 64, 5))
     out = []
     for row in range(20):
@@ -188,7 +188,7 @@ def test_a_silent_fluoroscope_is_awaited_if_it_lags_by_no_more_than_the_patience
 
 
 def test_a_fluoroscope_that_lags_for_good_does_not_delay_the_others():
-    """Far behind, or numbered differently: its frames are counted."""
+    """A stream far behind, or with different numbers, only has its frames counted."""
     for first in (-1000, 1000, 10**6):
         pairer = exposure_pairer('abc', PairingOptions(waiting=8, patience=5))
         out = []
@@ -221,7 +221,7 @@ def test_a_single_view_waits_as_long_as_its_queue():
 @pytest.mark.parametrize('count', [5, 200])
 @pytest.mark.parametrize('later', [True, False])
 def test_restarted_streams(count, later):
-    """Restarted fluoroscopes, or a repeated recording: stamps go on or fall back."""
+    """Restarted fluoroscopes, or a repeated recording: stamps continue or fall back."""
     pairer = exposure_pairer('abc', PairingOptions(waiting=64))
     for turn in range(3):
         frames = [
@@ -293,7 +293,7 @@ def test_exposures_paired_by_stamp_are_numbered():
 
 @pytest.mark.parametrize('by', BY)
 def test_two_fluoroscopes_are_paired_completely(by):
-    """Only complete exposures; the partner of a displaced frame is late."""
+    """Only complete exposures are returned; the partner of a displaced frame is late."""
     pairer = exposure_pairer('ab', PairingOptions(by, 0.001, 3, 1))
     assert not isinstance(pairer, PartialPairer)
     assert paired(pairer, [frame('a', row) for row in range(5)], flush=False) == []

@@ -14,7 +14,7 @@ SIZE = (1024, 1024)
 
 
 def film(poses=4, repeats=3, sd=0.1, name='a', seed=1):
-    """Frames of a phantom that stands still for some frames in each pose."""
+    """Return frames of a phantom that stands still for some frames in each pose."""
     rng = np.random.default_rng(seed)
     out = []
     for pose in range(poses):
@@ -65,7 +65,7 @@ def test_other_poses_other_angles_and_known_orientations_are_not_joined():
 
 
 def test_a_pose_is_repeated_only_where_all_fluoroscopes_see_it_so():
-    """Else an exposure would lose its partner."""
+    """Otherwise an exposure would lose its partner."""
     one, other = film(name='a'), film(name='b', seed=2)
     joined, _ = without_repeats({'a': one, 'b': other[1:]})
     assert [f.number for f in joined['a']] == [f.number for f in joined['b']] == [1, 4, 7, 10]

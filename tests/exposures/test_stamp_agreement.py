@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Frames that are paired by number, but are of different times."""
+"""Frames that are paired by number but were recorded at different times."""
 
 from dataclasses import dataclass
 
@@ -17,12 +17,12 @@ from fluoro_calib_ros.exposures.pairing import (
 from fluoro_calib_ros.exposures.stamps import _frame_interval
 
 MS = 1_000_000
-INTERVAL = 40 * MS  # 25 Hz
+INTERVAL = 40 * MS  # frame interval [ns] at 25 Hz
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What the pairing needs of a frame."""
+    """The attributes of a frame that the pairing needs."""
 
     fluoroscope: str
     number: int
@@ -76,7 +76,7 @@ def test_live_pairer_tells_it_and_forgets_it(names):
         for name in names:
             pairer.add(wrong if name == 'b' else Frame(name, right.number, right.stamp_ns))
     assert 'a and b' in pairer.stamps.disagreement()
-    # Cameras that were started again: the newest exposures count.
+    # After a restart of the cameras, the newest exposures count.
     for frames in zip(*(stream(name, 300, origin_ns=2 * 10**12) for name in names)):
         for frame in frames:
             pairer.add(frame)
@@ -91,7 +91,7 @@ def test_pairing_by_stamp_has_no_disagreement():
 
 
 def test_numbers_that_never_grow_give_no_frame_interval():
-    """A camera that sends one number again and again: the frames cannot be told apart."""
+    """A camera sends the same number again and again, so its frames cannot be told apart."""
     repeated = {
         name: [Frame(name, 1, frame.stamp_ns) for frame in stream(name, delay_ns=delay)]
         for name, delay in (('a', 0), ('b', INTERVAL))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the fuzzer found: each input is refused in a sentence."""
+"""Inputs that the fuzzer found: each is refused in one sentence."""
 
 import json
 import sqlite3
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
 
 def png_header(width, height):
-    """The beginning of a PNG that declares a size."""
+    """Return the beginning of a PNG that declares a size."""
     chunk = b'IHDR' + struct.pack('>IIBBBBB', width, height, 8, 0, 0, 0, 0)
     return (
         b'\x89PNG\r\n\x1a\n' + struct.pack('>I', 13) + chunk + struct.pack('>I', zlib.crc32(chunk))
@@ -85,7 +85,7 @@ def test_stack_whose_second_page_is_giant(tmp_path):
 
 
 def test_format_that_does_not_tell_its_size():
-    """OpenCV would decode it: WIDTH and HEIGHT of a PAM may be anything."""
+    """WIDTH and HEIGHT of a PAM may be anything, yet OpenCV would decode it."""
     content = b'P7\nWIDTH 30000\nHEIGHT 30000\nDEPTH 1\nMAXVAL 255\nTUPLTYPE GRAYSCALE\nENDHDR\n'
     with pytest.raises(DataError, match='this is no image that can be decoded'):
         decode(content + bytes(100))
@@ -98,7 +98,7 @@ def test_property_of_messages_can_fail(text):
 
 
 def test_video_without_a_pixel_format(tmp_path):
-    """OpenCV says -1."""
+    """OpenCV returns -1 as the pixel format."""
     path = tmp_path / 'trial.mp4'
     path.write_bytes(load('video').seeds()[1].replace(b'mvhd', b'xvhd'))
     assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == -1

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The targets of `make fuzz`, with hypothesis: every reader gives a result or one sentence.
+"""The targets of `make fuzz` with hypothesis: every reader gives a result or one sentence.
 
-Few examples a target, the same ones on every run. Hours of it: `make fuzz SECONDS=3600`.
+There are few examples per target, the same in every run. `make fuzz SECONDS=3600` runs longer.
 """
 
 import re
@@ -35,7 +35,7 @@ TOKENS = [
 ]
 WORD = re.compile(rb'[-+.\w]+')
 NEED_ROS = ('calibration_message', 'image_message', 'wire')
-EXAMPLES = {  # the slow ones
+EXAMPLES = {  # number of examples of the slow targets
     **{'exchange': 10, 'bag_mcap': 15, 'bag_metadata': 15, 'numbers': 6, 'result_folder': 5},
     **{
         'archive_npz': 20,
@@ -50,7 +50,7 @@ EXAMPLES = {  # the slow ones
 
 @st.composite
 def damaged(draw, seeds):
-    """A seed with some words, or some bytes anywhere, replaced, doubled, or cut off."""
+    """Return a seed in which some words or bytes are replaced, doubled or cut off."""
     content = bytearray(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(1, 4))):
         kind = draw(st.sampled_from(['word', 'bytes', 'double', 'cut', 'bit']))
@@ -72,7 +72,7 @@ def damaged(draw, seeds):
 
 
 def of_targets(names):
-    """Parameters of a test; those of targets that need ROS have its marker."""
+    """Return the parameters of a test; targets that need ROS get its marker."""
     return [pytest.param(n, marks=[pytest.mark.ros] if n in NEED_ROS else []) for n in names]
 
 
@@ -95,7 +95,7 @@ def test_reader_gives_a_result_or_one_sentence(name, tmp_path):
     property_holds()
 
 
-# Targets whose readers take different kinds of files: each seed is refused by one of them.
+# Readers of these targets take different kinds of files: each seed is refused by one reader.
 SEVERAL_KINDS = (
     *('bag_metadata', 'calibration_message', 'exchange', 'image_message', 'images', 'numbers'),
     *('phantom_csv', 'rig_toml'),
@@ -104,6 +104,6 @@ SEVERAL_KINDS = (
 
 @pytest.mark.parametrize('name', of_targets(n for n in NAMES if n not in SEVERAL_KINDS))
 def test_first_seed_is_accepted(name, tmp_path):
-    """Else the fuzzer would begin with what is refused at once."""
+    """Otherwise the fuzzer would begin with an input that is refused at once."""
     target = load(name)
     assert check(target, target.seeds()[0], tmp_path)

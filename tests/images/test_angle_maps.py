@@ -21,12 +21,12 @@ from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
 OK, OUTSIDE, INVALID = CorrectionStatus
 SIZE = (512, 512)
 ANGLES = (-0.9, -0.2, 0.3, 1.0)
-WORST_PX = 0.1  # beyond the calibrated area
+WORST_PX = 0.1  # largest error [px], which occurs outside the calibrated area
 
 
 @functools.cache
 def calibration():
-    """A calibration of small images that angles change by up to some 5 px."""
+    """Return a calibration of small images with changes by the angle of up to about 5 px."""
     return rigs.turning(rigs.pincushion('a', SIZE), size_px=0.4)
 
 
@@ -36,7 +36,7 @@ def maps():
 
 
 def errors(corrector, angle):
-    """Distances (n,) between pixels and their corrected sources, and the status (n,) there."""
+    """Return distances (n,) of pixels from their corrected sources, and their status (n,)."""
     v, u = np.nonzero(corrector.mask)
     x, y, *_ = calibration().correct_arrays(*corrector.source[:, v, u].astype(float), None, angle)
     return np.hypot(x - u, y - v), corrector.status[v, u]
@@ -49,7 +49,7 @@ def test_sources_of_pixels_are_corrected_to_them_at_the_angle(angle):
     error, status = errors(corrector, maps().rounded(angle))
     assert error[status == OK].max() < LIMIT_PX
     assert error.max() < WORST_PX and np.quantile(error, 0.999) < LIMIT_PX
-    # Rounding the angle moves no pixel by more than that again.
+    # Rounding the angle moves a pixel by less than the same limit once more.
     exact, _ = errors(corrector, angle)
     assert exact[status == OK].max() < 2 * LIMIT_PX
     mean, _ = errors(corrector, None)
@@ -59,7 +59,7 @@ def test_sources_of_pixels_are_corrected_to_them_at_the_angle(angle):
 @pytest.mark.long
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 def test_image_is_that_of_the_calibration_at_the_angle(interpolation):
-    """The map of the direct way, by a lookup grid of its own and an iteration at every pixel."""
+    """The direct way has a lookup grid of its own and iterates at every pixel."""
     of_rig = rigs.turning(rigs.calibrated('a').calibrations['a'], size_px=0.4)
     found = AngleMaps(of_rig, interpolation)
     angle = found.rounded(0.7)
@@ -87,7 +87,7 @@ def test_map_is_made_anew_only_where_a_pixel_moves():
     assert next_one is not first and found.built == 2
     moved = np.abs(next_one.source - first.source)
     assert 0 < np.nanquantile(moved, 0.99) < 3 * LIMIT_PX
-    # The same angle gives the same map, whatever was before.
+    # The same angle gives the same map, whatever angle came before.
     again = found.at(angle)
     assert np.array_equal(again.source, first.source, equal_nan=True)
 
@@ -124,7 +124,7 @@ def test_unknown_interpolation_is_refused():
 
 @pytest.mark.long
 def test_images_follow_a_field_that_was_estimated_from_exposures():
-    """At angles that were not calibrated, against the true change of the distortion."""
+    """The angles were not calibrated; the reference is the true change of the distortion."""
     estimated = turning_rig.turning().calibrations['a']
     found = AngleMaps(estimated)
     calibrated, others = turning_rig.recording()
@@ -141,7 +141,7 @@ def test_images_follow_a_field_that_was_estimated_from_exposures():
         by_mean = found.mean.source[:, v, u].T.astype(float)
         change = true_change(by_mean, angle)
         error = corrector.source[:, v, u].T - by_mean - change
-        # Shift, scale and shear are as well the interior orientation.
+        # Ignore shift, scale and shear, which the interior orientation may absorb as well.
         affine = np.column_stack([np.ones(len(u)), by_mean])
 
         def rms(values, affine=affine):
@@ -154,7 +154,7 @@ def test_images_follow_a_field_that_was_estimated_from_exposures():
     'size, worst', [((1000, 703), LIMIT_PX), ((333, 1024), LIMIT_PX), ((70, 45), 0.3)]
 )
 def test_map_of_an_image_of_any_size(size, worst):
-    """Also of one that is so small that its change is steep."""
+    """One of the images is so small that its change is steep."""
     found = rigs.turning(rigs.pincushion('a', size), size_px=0.4)
     maps = AngleMaps(found)
     corrector = maps.at(0.6)
@@ -175,7 +175,7 @@ def test_change_as_large_as_the_image_leaves_it_empty(size, size_px):
 
 
 def steep(size, steepness):
-    """A calibration whose correction grows by so many pixels a pixel in the middle."""
+    """Return a calibration whose correction grows by `steepness` px per px in the middle."""
     u, v = (np.linspace(0, side - 1, 25) for side in size)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     duv = np.zeros_like(uv)
@@ -187,7 +187,7 @@ def steep(size, steepness):
 
 @pytest.mark.parametrize('steepness', [0.9, 1.8])
 def test_folds_are_left_empty_at_an_angle(steepness):
-    """Where the correction of the mean folds, and where only the change makes it fold."""
+    """Either the mean correction folds, or only its change with the angle makes it fold."""
     corrector = AngleMaps(rigs.turning(steep((96, 96), steepness), size_px=2.0)).at(0.6)
     assert corrector.mask.any() and not corrector.mask.all()
     assert np.nanmin(np.diff(corrector.source[0], axis=1)) > 0

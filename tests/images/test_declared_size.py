@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Images that declare more pixels than are read; nothing is decoded to find out."""
+"""The declared size of an image is read without decoding anything."""
 
 import struct
 import zlib
@@ -23,7 +23,7 @@ IMAGE = np.arange(SIZE[0] * SIZE[1], dtype=np.uint8).reshape(SIZE[::-1])
 def test_declared_size_is_that_of_the_image(suffix):
     content = cv2.imencode(suffix, IMAGE)[1].tobytes()
     assert declared_size(memoryview(content)) == SIZE
-    # Cut off anywhere: no error, and no other size.
+    # Content cut off anywhere raises no error and declares no other size.
     for end in range(len(content)):
         assert declared_size(memoryview(content[:end])) in (SIZE, (SIZE[0], 0), (0, 0))
 

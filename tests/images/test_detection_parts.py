@@ -40,7 +40,7 @@ def second_derivative(image, scale):
 @pytest.mark.parametrize('scale', [1.5, 4.0])
 @pytest.mark.parametrize('across', [False, True])
 def test_noise_of_a_response_is_that_of_filtered_noise(scale, across):
-    """Noise that is correlated along the rows, or across them; the derivative is along them."""
+    """The noise is correlated along or across the rows; the derivative is along the rows."""
     white = RNG.normal(size=(700, 700)).astype(np.float32)
     kernel = np.array([0.2, 0.6, 0.2])
     kernel = kernel[:, None] if across else kernel[None]
@@ -85,7 +85,7 @@ def test_images_are_reduced_so_that_scales_are_told_apart():
 
 
 def test_places_in_a_reduced_image_are_those_of_the_whole():
-    """The middle of a pixel of a reduced image is between those of its pixels."""
+    """The centre of a pixel of a reduced image lies between the centres of its pixels."""
     fine = 4
     v, u = (np.mgrid[: fine * 160, : fine * 200] + 0.5) / fine - 0.5
     centre = np.array([90.4, 70.7])
@@ -96,7 +96,7 @@ def test_places_in_a_reduced_image_are_those_of_the_whole():
         dark, _ = _blobs(part, Noise(1.0, 0.0, WHITE), 6.0 / factor, factor)
         strongest = dark.uv[np.argmax(dark.response)]
         np.testing.assert_allclose(strongest, centre, atol=0.15)
-        # A quarter of the height: the blur is as wide as the blob.
+        # The response is a quarter of the height, as the filter is as wide as the blob.
         best = np.argmax(dark.response)
         assert dark.response[best] == pytest.approx(400 / 4, rel=0.15)
         assert dark.relative[best] == pytest.approx(100 / 960, rel=0.18)
@@ -110,7 +110,7 @@ def test_a_pixel_is_in_the_field_by_its_middle():
     field[1, 2] = True
     uv = np.array([[2.4, 1.4], [2.6, 1.4], [2.4, 1.6], [1.6, 0.6]])
     assert _inside(uv, field).tolist() == [True, False, False, True]
-    # Pixels 4 and 5, rows 2 and 3 of the whole image.
+    # The field covers columns 4 and 5 and rows 2 and 3 of the whole image.
     uv = np.array([[3.6, 1.6], [5.4, 3.4], [3.4, 2.0], [5.0, 3.6]])
     assert _inside(uv, field, 2).tolist() == [True, True, False, False]
 
@@ -131,7 +131,7 @@ def test_vertex_is_that_of_the_parabola():
 
 
 def test_several_maxima_in_a_larger_blob_are_one(monkeypatch):
-    """Where it responds more strongly; neither where it does not, nor where there is only one."""
+    """They are merged only if there are several and the larger blob responds more strongly."""
     uv = np.array([[50.0, 50], [56, 50], [100, 100], [180, 60]])
     blobs = _Blobs(uv, np.full(4, 9.0), np.array([0.3, 0.4, 0.3, 0.2]))
     sight = _Sight(np.zeros((200, 240), np.float32), None, 4)
@@ -148,7 +148,7 @@ def test_several_maxima_in_a_larger_blob_are_one(monkeypatch):
 
         monkeypatch.setattr(detection, '_blobs', found)
         out = sight.merged(blobs, 3.0, False)
-        # 4.2, 6 and 8.4 px, in images in which these are 2.9 px at least.
+        # 4.2, 6 and 8.4 px, each searched in an image in which the scale is 2.9 px or more.
         assert [factor for _, _, factor in asked] == [1, 2, 2]
         assert [scale * factor for _, scale, factor in asked] == pytest.approx([4.2, 6.0, 8.4])
         assert asked[1][0] == (100, 120)
@@ -164,7 +164,7 @@ def test_several_maxima_in_a_larger_blob_are_one(monkeypatch):
 
 
 def test_usual_depth_is_linear_in_the_light_without_the_odd_ones():
-    """Contrast = depth times light: a share of the direct light, and what a sheet adds."""
+    """Contrast is depth times light: a share of the direct light, plus what a sheet adds."""
     light = RNG.uniform(500, 2000, 60)
     relative = light / np.median(light)
     depth = (0.8 * relative + 0.15) / relative
@@ -213,7 +213,7 @@ def test_a_bead_without_neighbours_is_refused_unless_they_are_vague(kind, is_kep
 
 
 def test_looks_are_tried_in_their_order_until_a_pose_is_sure(monkeypatch):
-    """The reason is that of the likeliest look; an ambiguous pose ends the search."""
+    """The reason given is that of the likeliest look; an ambiguous pose ends the search."""
 
     def searched(outcomes):
         tried = []

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Beads whose shadows overlap are told apart by the discs in the mask of what is dark."""
+"""Beads with overlapping shadows are separated by fitting discs into the mask of dark pixels."""
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from fluoro_calib_ros.images.discs import set_apart
 
 
 def light_of(places: np.ndarray, radius: float, seed: int = 1) -> np.ndarray:
-    """Relative light (300, 300) behind discs that let a fifth of it pass."""
+    """Return relative light (300, 300) behind discs that transmit a fifth of it."""
     v, u = np.mgrid[:300, :300]
     image = np.ones((300, 300))
     for x, y in places:

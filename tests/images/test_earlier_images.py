@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Late decisions change earlier images, and say which ids these had wrong."""
+"""Late decisions change earlier images and report which of their ids were wrong."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Beads of rendered radiographs: found, measured, matched; what is not the phantom is refused."""
+"""Beads of rendered radiographs are found, measured and matched; other objects are refused."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def model() -> PhantomModel:
 
 @cache
 def radiograph() -> tuple[np.ndarray, np.ndarray, Radiography]:
-    """A noisy image with clutter, and the true centres."""
+    """Return a noisy image with clutter, the true centres, and the radiography."""
     radiography = Radiography(rig().fluoroscopes[0], HARD)
     pose = phantom_poses(np.random.default_rng(4), 3)[1]
     image = radiography.image(rig().true_mm, pose, seed=4)
@@ -90,17 +90,17 @@ def test_bright_beads_are_the_same_beads():
 
 
 def test_beads_of_one_size_are_found_without_a_search_for_larger_ones():
-    """What an image before tells: the noise, and that no bead is much larger than others."""
+    """A previous image provides the noise, and that no bead is much larger than the others."""
     image, true, _ = radiograph()
     found = detect_beads(image)
     look = Look(found.radius_px, False, found.noise, alike=True)
     again = detect_beads(image, look=look)
     assert again.noise is found.noise
-    # Two that touch are no large one.
+    # Without the search for larger beads, two beads that touch are not taken for a large one.
     of_true = [np.count_nonzero(cKDTree(one.uv).query(true)[0] < 1) for one in (found, again)]
     assert of_true[1] >= of_true[0] > 0.7 * len(true)
     away, _ = cKDTree(true).query(again.uv)
-    assert np.mean(away < 2) > 0.9  # there is clutter
+    assert np.mean(away < 2) > 0.9  # the others are clutter
 
 
 def test_each_refused_bead_has_a_reason():
@@ -116,7 +116,7 @@ OVERLAPPING = np.array([[40.2, 40.4], [55.9, 40.9], [100.3, 40.1]])
 def blurred_shadows(
     centres: np.ndarray, radii: np.ndarray, light: float, attenuation: float
 ) -> np.ndarray:
-    """Light (80, 140) behind spheres (n,), attenuation along a radius of 12 px, blur of 1 px."""
+    """Return light (80, 140) behind spheres (n,) [px]; attenuation along 12 px, blur of 1 px."""
     axis = np.arange(0, 560) / 4
     u, v = np.meshgrid(axis, axis[:320])
     grey = light * np.ones(u.shape)
@@ -127,9 +127,9 @@ def blurred_shadows(
 
 
 def overlapping_beads(radius_px, most=np.inf):
-    """Beads with a radius of 12 px, two of which overlap, measured with another radius.
+    """Return beads of radius 12 px, two of which overlap, as measured with another radius.
 
-    most: light beyond which grey values are clipped.
+    most: grey value at which the light is clipped.
     """
     light = blurred_shadows(OVERLAPPING, np.full(3, 12.0), 800.0, 1.9)
     image = np.minimum(np.random.default_rng(3).poisson(light), most).astype(np.float32)
@@ -143,18 +143,18 @@ def overlapping_beads(radius_px, most=np.inf):
 
 
 def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
-    """One of a radius of 12 px that is taken as 12.12 px; alone, it moves no centre."""
+    """The true radius of 12 px is taken as 12.12 px; this does not move an isolated bead."""
     beads = overlapping_beads(12.12)
     off = np.linalg.norm(beads.uv - OVERLAPPING, axis=1)
     assert list(beads.overlapped) == [True, True, False]
     assert off[:2].min() > 0.03 and off[2] < 0.03
     assert (off < 3 * beads.sigma).all()
-    # Alone, it is as sure as the noise lets it be.
+    # The isolated bead is limited by the noise only.
     assert beads.sigma[2] < 0.01 < 0.025 < beads.sigma[:2].min()
 
 
 def test_a_shadow_that_a_larger_one_hides_is_less_sure():
-    """By the radii of both, as far as the edge is hidden; the larger one hardly moves."""
+    """Errors of both radii move it where its edge is hidden; the larger bead hardly moves."""
     profile = Profile(6.0, 1.0, 0.6, 0.0)
     size = np.array([1.0, 2.0])
     uv = np.array([[40.2, 40.4], [50.6, 40.9]])
@@ -167,14 +167,14 @@ def test_a_shadow_that_a_larger_one_hides_is_less_sure():
     )
     moved = np.linalg.norm(large.uv - small.uv, axis=1) / 2
     assert moved[0] > 2 * moved[1]
-    # A coordinate, by a hundredth of the radii; both change here, and the larger one moves less.
+    # A coordinate, for 1 % of the radii; here both radii change, and the larger bead moves less.
     expected = 10 * moved / np.sqrt(2)
     assert right.sigma[0] == pytest.approx(expected[0], rel=0.2)
     assert expected[1] < right.sigma[1] < 2 * expected[1]
 
 
 def test_beads_that_overlap_in_clipped_light_are_less_sure():
-    """Only the inside of their shadows tells the radius; a bead alone is about as sure."""
+    """Only the inside of their shadows determines the radius; a bead alone is about as sure."""
     beads = overlapping_beads(12.12)
     clipped = overlapping_beads(12.12, most=500.0)
     assert list(clipped.overlapped) == [True, True, False]
@@ -186,7 +186,7 @@ def test_two_overlapping_beads_have_honest_sigmas():
     profile = Profile(2.8, 0.9, 1.2, 0.0)
     rng = np.random.default_rng(3)
     true = np.array([[10.3, 11.8], [14.6, 12.4]])
-    # Attenuated on a fine grid, blurred, and read where the pixels are.
+    # Attenuate the light on a fine grid, blur it, and sample it at the pixels.
     axis = np.arange(-10, 240) / 10
     fine = np.stack(np.meshgrid(axis, axis), axis=-1)
     light = 800.0 * np.ones(fine.shape[:2])
@@ -216,7 +216,7 @@ def test_two_overlapping_beads_have_honest_sigmas():
 
 
 def test_shadow_whose_border_the_image_cuts_is_not_measured():
-    """What is no sphere, such as a hole of a sheet, would move."""
+    """For objects other than spheres, such as holes of a sheet, the centre would be biased."""
     profile = Profile(4.0, 0.9, 1.2, 0.0)
     field = np.ones((60, 60), bool)
     true = np.array([[3.6, 30.0], [30.0, 55.2], [30.0, 4.6], [54.4, 30.0]])
@@ -233,7 +233,7 @@ def test_shadow_whose_border_the_image_cuts_is_not_measured():
 
 @pytest.mark.parametrize('shape', [(3.0, 0.9, 1.5), (2.0, 1.5, 0.5), (9.0, 1.2, 3.0)])
 def test_shadow_has_the_derivatives_of_its_differences(shape):
-    """Of differences so wide that the grid of the shadow does not matter."""
+    """The differences are so wide that the grid of the shadow does not matter."""
     distance = np.arange(0, shape[0] + 3 * shape[1], 0.25)
     derivatives = shadow_derivatives(Profile(*shape), distance)
     for column, step in enumerate(np.diag([0.3, 0.02, 0.02])):
@@ -250,7 +250,7 @@ def test_profile_is_fitted_to_its_shadow():
     share = 0.9 * true.shadow(distance)[0]
     absorbed = Absorbed(distance, share, np.ones(4000), np.ones(4000))
     start = Profile(3.0, 1.0, 1.5, 0.1)
-    for _ in range(10):  # of a few steps each
+    for _ in range(10):  # each call makes a few steps only
         start = fit_profile(absorbed, start)
     assert start.radius_px == pytest.approx(3.4, rel=0.002)
     assert start.blur_px == pytest.approx(0.8, rel=0.02)
@@ -302,7 +302,7 @@ def test_the_pose_of_a_regular_phantom_is_refused():
     uv = view.project(cube)
     with refused(Kind.POSE_AMBIGUOUS):
         match(Seen.of(uv, field, 3.0), PhantomModel.of(cube), LENS)
-    # A few beads off the grid make it unique.
+    # A few beads off the grid make the pose unique.
     rng = np.random.default_rng(1)
     marked = cube + rng.uniform(-6, 6, cube.shape)
     uv = view.project(marked)
@@ -312,7 +312,7 @@ def test_the_pose_of_a_regular_phantom_is_refused():
 
 
 def regular_cube(large: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """64 beads in four layers, of 2 mm but for some of 3 mm."""
+    """Return 64 beads in four layers and their diameters: 2 mm, but 3 mm for rows of `large`."""
     axis = np.arange(4) * 40.0 - 60
     cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     diameter = np.full(64, 2.0)
@@ -339,7 +339,7 @@ def small_phantom(seed: int) -> np.ndarray:
 
 
 def seen_of(xyz: np.ndarray) -> Seen:
-    """What is found of points in some pose."""
+    """Return the detections of points in some pose."""
     rotation = matrix_from_vector([0.3, -0.5, 0.2])
     position = -rotation.T @ np.array([10.0, -5.0, 1500.0])
     view = View(LENS, rotation, position, 4000.0, np.zeros((2, 2)), 1)
@@ -374,7 +374,7 @@ def test_a_pose_nearby_is_followed(shift_mm):
 
 @pytest.mark.parametrize('degrees', [8, 25])
 def test_a_pose_far_off_is_followed(degrees):
-    """As between exposures of a film of which most are left out."""
+    """Such steps occur between exposures of a film most of which are excluded."""
     xyz = small_phantom(1)
     seen = seen_of(xyz)
     model = PhantomModel.of(xyz)
@@ -389,7 +389,7 @@ def test_a_pose_far_off_is_followed(degrees):
 
 
 def test_a_motion_goes_on():
-    """A phantom that turns and moves evenly is where it is expected to be."""
+    """A phantom that turns and moves evenly is predicted correctly."""
     turn = np.array([0.02, -0.03, 0.01])
     centre = np.array([5.0, 6.0, 7.0])
 
@@ -405,7 +405,7 @@ def test_a_motion_goes_on():
 
 
 def test_a_grid_is_not_followed_by_a_step_of_its_pattern():
-    """A regular grid looks alike in several places: none of them is guessed."""
+    """A regular grid looks alike in several places, none of which is guessed."""
     side = np.arange(15) * 10.0 - 70
     xyz = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
     rotation = matrix_from_vector([0.1, 0.2, 0.0])

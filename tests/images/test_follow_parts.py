@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of following and of finding: limits, sums spelt out, and shadows that touch."""
+"""Parts of following and of finding: limits, written-out sums, and shadows that touch."""
 
 import functools
 from dataclasses import replace
@@ -43,7 +43,7 @@ WHITE[LAGS, LAGS] = 1.0
 
 
 def light_behind(places, radius, blur, attenuation, ways=(0.0,), shape=(70, 100)):
-    """Light (h, w) without noise behind spheres that move by ways (q, 2), each as long."""
+    """Return light (h, w) without noise behind spheres that stay at each of the ways (q, 2)."""
     fine = 5
     v, u = (np.mgrid[: fine * shape[0], : fine * shape[1]] + 0.5) / fine - 0.5
     total = np.zeros_like(u)
@@ -65,7 +65,7 @@ def touching(apart):
 
 @pytest.mark.parametrize('apart', [4.0, 7.0, 10.0])
 def test_beads_that_touch_are_where_they_are_without_noise(apart):
-    """What two shadows have in common is blurred together, and not the product of both."""
+    """The overlap of two shadows is blurred as a whole, not as a product of blurred shadows."""
     places, light = touching(apart)
     found = measure_beads(
         Light(light.astype(np.float32), np.ones(light.shape, bool)),
@@ -126,7 +126,7 @@ def test_floor_of_a_response_grows_in_the_dark():
 
 
 def test_voters_are_counted_where_they_are_found_in_the_field():
-    """A pixel begins half a pixel before its centre; 2 is off the field."""
+    """A pixel begins half a pixel before its centre; the value 2 marks pixels off the field."""
     field = np.zeros((9, 12), np.uint8)
     field[6, 4] = 1
     field[2, 9] = 2
@@ -134,7 +134,7 @@ def test_voters_are_counted_where_they_are_found_in_the_field():
     voter = np.array([[[0.0], [0.0], [0.0]], [[1.0], [0.0], [0.0]], [[0.0], [2.0], [0.0]]])
     axes = np.array([[[5.0, -4.0], [40.0, 40.0], [0.0, 0.0]]], np.float32)
     for centre, hits, inside in (
-        ((4.4, 6.4), 1, 1),  # itself; the next one is off the field
+        ((4.4, 6.4), 1, 1),  # itself; the other is off the field
         ((3.6, 5.6), 1, 1),
         ((4.6, 6.4), 0, 2),
         ((4.4, 6.6), 0, 2),
@@ -156,13 +156,13 @@ def moving(uv, velocity=0.0, sd=0.3, speed_sd=0.1):
 
 def test_acceleration_is_learned_from_innovations_of_settled_markers():
     motion = moving(np.zeros((4, 2)), sd=1.0)
-    motion.covariance[3, 1, 1] = 9.0  # not settled: as much as a quarter of the first variance
+    motion.covariance[3, 1, 1] = 9.0  # unsettled: a quarter of the first variance
     motion.squared[:] = [0.5, 0.5, 0.5, 0.5]
     sigma = np.array([0.3, 0.3, 5.0, 0.3])
     np.testing.assert_allclose(motion.innovation_variance(sigma), 1 + sigma**2 + 0.05**2)
     uv = np.array([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0], [3.0, 4.0]])
     motion.update(np.arange(4), uv, sigma, 2)
-    seen = 12.5 / 16 - 0.09  # half a squared length, over the fourth power of the frames
+    seen = 12.5 / 16 - 0.09  # half a squared length over frames^4, minus sigma^2
     np.testing.assert_allclose(motion.squared, [0.45 + 0.1 * seen, 0.45, 0.45, 0.5])
     gain = 1 / (1 + sigma**2 + 0.05**2)
     np.testing.assert_allclose(motion.uv, gain[:, None] * uv)
@@ -199,10 +199,10 @@ def test_velocities_are_compared_once_markers_were_seen_together(together, is_kn
     assert rows.tolist() == list(range(6)) and others.tolist() == [[1, 1]] * 6
     expected = 25 / (0.09 + 0.5**2) if is_known else 0.0
     assert ratio[0] == pytest.approx(expected)
-    assert len(motion.strangeness(np.arange(6) < 4)[0]) == 0  # four have no four others
+    assert len(motion.strangeness(np.arange(6) < 4)[0]) == 0  # none has four others to compare
 
 
-# ---- a tracker that is told where markers are
+# ---- a tracker that is given the places of markers
 
 
 def tracker():
@@ -250,10 +250,10 @@ def test_following_begins_with_four_markers_that_are_suggested_closely():
     uv = np.array([[5.0, 5], [50, 60], [70, 20], [98.9, 78.9], [99, 40], [40, 0]])
     one.suggest(ids, uv, np.zeros((6, 2)), np.full(6, 1.49))
     places = one._first_places((80, 100), 7)
-    assert np.isfinite(places[:, 0]).tolist() == [True] * 4 + [False] * 2  # at the edge
+    assert np.isfinite(places[:, 0]).tolist() == [True] * 4 + [False] * 2  # two at the edge
     np.testing.assert_allclose(places[:4], uv[:4])
     with pytest.raises(DataError):
-        one._first_places((80, 100), 36)  # not before 30 more images
+        one._first_places((80, 100), 36)  # none before 30 more images
     assert len(one._first_places((80, 100), 37)) == 6
     other = MarkerTracker(first=None, later=ids)
     other.suggest(ids[:4], uv[:4], np.zeros((4, 2)), np.array([1.0, 1.0, 1.0, 1.5]))
@@ -369,7 +369,7 @@ def test_a_phantom_goes_on_in_its_way_and_its_turn(factor):
         one.rotation @ (centre - one.position) for one in (before, last, ahead)
     )
     np.testing.assert_allclose(third, second + factor * (second - first), atol=1e-9)
-    assert following.moved_on(before, last, centre, 13.0) is None  # by 0.65 rad
+    assert following.moved_on(before, last, centre, 13.0) is None  # would turn by 0.65 rad
     assert following.moved_on(before, last, centre, 12.0) is not None
 
 
@@ -388,7 +388,7 @@ def test_a_pose_that_is_followed_has_residuals_as_before(
     monkeypatch.setattr(following, 'settle', lambda view, xyz, seen: found)
     monkeypatch.setattr(following, '_elsewhere', lambda *given: iter([None]))
     seen = Fake(uv=np.zeros((matching.MIN_BEADS, 2)))
-    # 1.5 times the scatter before and a tenth of a pixel.
+    # The limit is 1.5 times the previous scatter plus a tenth of a pixel.
     assert following.follow(seen, Fake(xyz=None), None, 0.6) is (found if fits else None)
     few = Fake(uv=np.zeros((matching.MIN_BEADS - 1, 2)))
     assert following.follow(few, Fake(xyz=None), None, 0.6) is None
@@ -436,7 +436,7 @@ def test_of_two_poses_of_a_grid_one_has_half_the_residuals(monkeypatch):
     assert grid_match(monkeypatch, [*[None] * matching.FITTED, 0.5]) is None
     with pytest.raises(DataError, match='ambiguous'):
         grid_match(monkeypatch, [0.5, *[None] * matching.FITTED, 0.5])
-    # So many fit that others are not looked at.
+    # The first FITTED matches all fit, so that the last one is not fitted.
     assert grid_match(monkeypatch, [0.5, *[1.0] * (matching.FITTED - 1), 0.5]) == 0
     for rival in (0.99, 0.25, 0.5):
         with pytest.raises(DataError, match='ambiguous') as told:
@@ -480,7 +480,7 @@ def test_of_poses_that_fit_alike_sizes_tell(monkeypatch, rivals, by_size, taken)
 
 
 def bodies_that_learn(monkeypatch, known):
-    """MarkerBodies of one body of four markers, and what its shape was learned from."""
+    """Return MarkerBodies of a body with four markers, the data for its shape, and its updates."""
     learned = []
     told = []
     monkeypatch.setattr(
@@ -508,10 +508,10 @@ def test_a_shape_is_learned_from_exposures_of_three_sure_markers(monkeypatch):
     bodies, learned, told = bodies_that_learn(monkeypatch, [False] * 4)
     xyz = RNG.normal(0, 30, (5, 3))
     bodies.learn(seen_at(xyz), np.array([True, True, True, False, False]))
-    assert not learned  # two of the body
+    assert not learned  # only two markers of the body
     for number in range(1, 6):
         bodies.learn(seen_at(xyz + number), np.array([True, True, True, True, False]))
-    # Of the first, the second and the fourth exposure.
+    # The shape is learned at the first, the second and the fourth exposure.
     assert [len(places) for places, _ in learned] == [1, 2, 4] and len(told) == 3
     places, covariance = learned[-1]
     np.testing.assert_allclose(places[3, :3], xyz[1:4] + 4)
@@ -531,7 +531,7 @@ def test_a_known_shape_is_not_learned_and_markers_off_their_place_are_not_used(m
         del learned[:]
         bodies._seen[0].clear()
         bodies.learn(seen_at(xyz), every)
-        assert bool(np.isfinite(learned[0][0][0, 0]).all()) is use  # four times 0.1 mm
+        assert bool(np.isfinite(learned[0][0][0, 0]).all()) is use  # limit: four times 0.1 mm
 
 
 def test_bodies_are_lost_whose_pose_is_not_known(monkeypatch):
@@ -555,7 +555,7 @@ def test_bodies_are_lost_whose_pose_is_not_known(monkeypatch):
 def test_doubtful_ids_that_fit_a_shape_support_each_other(
     monkeypatch, sure, agree, alive, is_used
 ):
-    """Where a body is lost, and three sure markers do not give its pose."""
+    """It requires a lost body and at most two sure markers, too few for its pose."""
     tracker = Fake(filter=Fake(alive=np.array([alive])))
     monkeypatch.setattr(
         'fluoro_calib_ros.images.marker_rays.BodyTracker', lambda rig, bodies: tracker
@@ -576,7 +576,7 @@ def test_doubtful_ids_that_fit_a_shape_support_each_other(
 
 @pytest.mark.parametrize('needed', [1, 3, 9])
 def test_sizes_of_shadows_are_tried_until_all_bodies_are_found(monkeypatch, needed):
-    """The strongest shadows, as many as markers, then as few as one body needs."""
+    """Each size is tried with as many of the strongest shadows as markers, then as one body."""
     looks = []
 
     class Search:
@@ -608,7 +608,7 @@ def test_sizes_of_shadows_are_tried_until_all_bodies_are_found(monkeypatch, need
 
 
 def image_search(monkeypatch, outcomes):
-    """Search of bodies 'one' and 'other', and the calls of its parts."""
+    """Return a search of bodies 'one' and 'other', and the calls of its parts."""
     filtered, asked = [], []
     monkeypatch.setattr(
         marker_ids,
@@ -699,7 +699,7 @@ def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
 
 
 def test_poses_are_compared_by_the_sizes_of_the_beads_that_all_of_them_have(monkeypatch):
-    """As logarithms: the size of a shadow, and the response to it; at least ten beads."""
+    """Logarithms of shadow sizes and of responses are compared for at least ten common beads."""
     xyz = RNG.normal(0, 20, (14, 3))
     diameter = np.where(np.arange(14) % 3, 2.0, 3.0)
     seen = Fake(strength=RNG.uniform(0.5, 2, 16), uv=RNG.uniform(0, 900, (16, 2)))
@@ -729,10 +729,10 @@ def test_poses_are_compared_by_the_sizes_of_the_beads_that_all_of_them_have(monk
         np.testing.assert_allclose(response, expected)
         assert uv.tolist() == seen.uv[detection].tolist()
     values[:] = [5.0, 4.9 + matching.LIKELIER]
-    assert matching._best_by_size(matches, seen, model) is None  # none stands out
+    assert matching._best_by_size(matches, seen, model) is None  # no pose stands out
     values[:] = [99.0, 5.0]
     assert matching._best_by_size(matches, seen, model) is matches[0]
-    matches[1].detection = matches[1].detection + 3  # nine in common
+    matches[1].detection = matches[1].detection + 3  # nine beads in common
     matches[0].detection, matches[0].bead = matches[0].detection[:12], matches[0].bead[:12]
     assert matching._best_by_size(matches, seen, model) is None
     for other in (None, np.full(14, 2.0)):

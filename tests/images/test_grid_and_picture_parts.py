@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Lattices against a count of all shifts, pictures pixel by pixel, and what views tell others."""
+"""Lattices against a count of all shifts, pictures by pixel, and predictions between views."""
 
 from types import SimpleNamespace as Fake
 
@@ -34,7 +34,7 @@ def places(rows, columns, without=()):
 
 
 def test_shifts_of_a_lattice_are_those_of_which_most_beads_agree():
-    """Against a count of all shifts: what is found speaks for one, what is missing against it."""
+    """All shifts are counted: found beads support a shift, missing ones contradict it."""
     grid = places(6, 8, [(2, 3), (4, 6)]) - [3, 2]
     found = places(4, 5, [(1, 2)]) + [7, -4]
     missing = np.array([[8, -2]])
@@ -99,7 +99,7 @@ def test_points_are_numbered_along_a_bent_lattice():
     assert abs(np.linalg.det(change)) == pytest.approx(1)
     np.testing.assert_allclose(change, np.rint(change), atol=1e-9)
     assert lattice.number_lattice(uv[:8]) is None
-    # Most of the points have to be on it.
+    # Most of the points have to lie on the lattice.
     assert lattice.number_lattice(np.vstack([uv[:9], RNG.uniform(400, 900, (30, 2))])) is None
 
 
@@ -121,7 +121,7 @@ def test_a_picture_has_full_contrast():
     assert overlay._picture(np.zeros((512, 513), np.uint8))[1] == 1
     assert overlay._picture(np.zeros((512, 512), np.uint8))[1] == 2
     assert overlay._place([10.3, 4.8], 1) == (10, 5)
-    assert overlay._place([10.0, 4.0], 2) == (20, 8)  # 20.5 and 8.5, the even ones
+    assert overlay._place([10.0, 4.0], 2) == (20, 8)  # 20.5 and 8.5 are rounded to even
 
 
 def test_a_large_image_is_reduced_and_a_small_one_is_not():
@@ -218,7 +218,7 @@ def test_covered_cells_are_green_where_they_are(size):
     assert not framed[rows // 2, 400]
 
 
-# ---- images that are corrected
+# ---- corrected images
 
 
 def test_a_fold_is_where_neighbours_are_seen_mirrored():
@@ -237,7 +237,7 @@ def test_a_fold_is_where_neighbours_are_seen_mirrored():
 
 
 def test_a_correction_goes_on_beyond_the_border_as_steep_as_before():
-    """A linear one is linear everywhere."""
+    """A linear correction is linear everywhere."""
 
     def look_up(u, v):
         inside = (u >= -0.5) & (u < 99.5) & (v >= -0.5) & (v < 79.5)
@@ -256,7 +256,7 @@ def test_a_correction_goes_on_beyond_the_border_as_steep_as_before():
     np.testing.assert_allclose(observed - moved, undistorted, atol=1e-3)
 
 
-# ---- what views tell each other
+# ---- what views predict for each other
 
 
 class Tracker:
@@ -282,7 +282,7 @@ def test_places_of_a_body_tell_the_velocity_by_the_second_image():
     states = states_at([[100, 100], [200, 100], [300, 100]])
     states.advance(1, None)
     states.place(np.array([0, 2]), np.array([[120.0, 110], [300.2, 100]]), frames=1)
-    # The third marker is there anyway, and the second one was not asked for.
+    # The third marker is already there, and the second one was not requested.
     assert states.motion.uv.tolist() == [[120, 110], [200, 100], [300, 100]]
     assert states.motion.covariance[0].tolist() == [[2.25, 0], [0, 36]]
     assert not states.motion.velocity.any() and states.placed[0] == 0 and states.unseen[0] == 1
@@ -291,7 +291,7 @@ def test_places_of_a_body_tell_the_velocity_by_the_second_image():
     states.place(np.array([0]), np.array([[150.0, 116]]), frames=2)
     assert states.motion.velocity[0].tolist() == [15, 3]
     assert states.motion.covariance[0].tolist() == [[2.25, 0], [0, 2.25]]
-    states.unseen[0] = 9  # long not seen: the place before says nothing
+    states.unseen[0] = 9  # unseen for long: the previous place is not used
     states.place(np.array([0]), np.array([[10.0, 20]]), frames=1)
     assert states.motion.uv[0].tolist() == [10, 20] and not states.motion.velocity[0].any()
 
@@ -305,7 +305,7 @@ def test_a_body_of_which_less_than_half_is_seen_again_is_elsewhere():
     before[:, [0, 1, 2, 4, 5, 7]] = True
     now = np.zeros((2, 9), dtype=bool)
     now[0, [0, 1, 4, 5, 6]] = True
-    # Two of six; two of four, which is half (one that enters does not count); none of two.
+    # Seen again: two of six; two of four, which is half (not counting a new marker); none of two.
     assert np.flatnonzero(bodies.miss(now, before)).tolist() == [0, 1, 2]
     assert lost == [[True, False, False]]
     assert not bodies.miss(now[:0], before[:0]).any()
@@ -344,7 +344,7 @@ def test_markers_of_a_body_without_pose_are_doubted_where_no_other_view_supports
         Fake(view=0, tracker=tracker, doubt=lambda rows, frame: doubted.append(rows.tolist()))
     ]
     joined._target_id = np.arange(1, 8)
-    # Of the second body markers 3 and 7, of the others all other ones.
+    # Markers 3 and 7 belong to the second body, all others to other bodies.
     second = np.array([0, 0, 1, 0, 0, 0, 1], dtype=bool)
     joined._again = [Fake(target_id=np.array([3, 7]))] if once else []
     agree = np.array([[0, 0, 0, 0, 1, 0, 0]], dtype=bool)
@@ -382,7 +382,7 @@ def test_what_is_told_is_expected_to_go_on_by_the_exposures_between():
         return MarkerPlaces(np.array([[x, 0.0, 0]]), np.eye(3)[None])
 
     told = _Told(at(0.0), at(0.0)).next(at(1.0), 4).next(at(3.0), 6)
-    # 2 mm in 2 exposures.
+    # The motion is 2 mm in 2 exposures.
     assert told.expected(7).xyz_mm[0, 0] == 4.0 and told.expected(10).xyz_mm[0, 0] == 7.0
     assert (told.frame, told.frame_before) == (6, 4)
 
@@ -395,7 +395,7 @@ def rig():
 
 
 def test_spread_of_a_point_is_that_of_its_projection(rig):
-    """By finite differences along the axes of its covariance."""
+    """The projection is differentiated numerically along the axes of the covariance."""
     made, known = rig
     xyz = np.array([[10.0, -20, 30]])
     half = RNG.normal(size=(3, 3))
@@ -416,7 +416,7 @@ def test_shadows_of_three_views_meet_in_points(rig):
     made, known = rig
     xyz = np.array([[10.0, -20, 5], [-15, 12, 30], [28, 30, -20], [-30, -25, -10]])
     shadows = [f.ideal(xyz) for f in made.fluoroscopes]
-    shadows[1] = np.vstack([shadows[1][[2, 0, 3]], [[900.0, 40.0]]])  # does not see the second
+    shadows[1] = np.vstack([shadows[1][[2, 0, 3]], [[900.0, 40.0]]])  # not the second point
     shadows[2] = shadows[2][[1, 3, 0, 2]]
     found = shadow_points(shadows, known)
     expected = {(0, 1, 2): xyz[0], (1, -1, 0): xyz[1], (2, 0, 3): xyz[2], (3, 2, 1): xyz[3]}
@@ -424,7 +424,7 @@ def test_shadows_of_three_views_meet_in_points(rig):
     for key, place in expected.items():
         np.testing.assert_allclose(rows[key], place, atol=1e-3)
     assert len(rows) <= 6 and (found.variance > 0).all()
-    # Points of two rays are not as sure as those of three.
+    # Points of two rays are less accurate than those of three.
     three = (found.shadow >= 0).all(axis=1)
     assert found.variance[three].max() < found.variance[~three].min() * 1.5
 
@@ -437,7 +437,7 @@ def test_points_of_fewer_rays_explain_what_others_do_not():
 
 
 def test_views_are_told_where_unsure_markers_are_expected():
-    """By bodies, else by other views; with the velocity between both exposures."""
+    """Places come from bodies, otherwise from other views; the velocity, from two exposures."""
     ids = np.array([3, 5, 8])
     joined = JoinedViews.__new__(JoinedViews)
     tracker = Tracker(unsure=[5, 8])
@@ -463,9 +463,9 @@ def test_views_are_told_where_unsure_markers_are_expected():
     ((told_ids, uv, velocity, sd),) = tracker.told
     assert told_ids == [5, 8]
     assert uv.tolist() == [[30, 30], [100, 100]] and sd.tolist() == [0.03, 0.1]
-    # From 2 and 8 at the other angle, two exposures before.
+    # The places before are 2 and 8 at the previous angle, two exposures earlier.
     assert velocity.tolist() == [[-5, -5], [-30, -30]]
-    # A body that has just been found tells it better.
+    # A body that has just been found predicts its marker better.
     joined._suggest(12, ids == 8)
     assert tracker.told[-1][0] == [5]
 

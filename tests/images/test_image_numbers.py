@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers of parts of extraction and following on a few points."""
+"""Numerical results of parts of extraction and following, for a few points."""
 
 from copy import deepcopy
 from itertools import permutations
@@ -53,9 +53,9 @@ def view(coefficients=np.zeros((2, 5))):
 
 
 def test_shadow_of_a_sphere_lies_farther_out_than_its_centre():
-    """An ellipse, whose middle is half way between the rays that touch the sphere."""
+    """It is an ellipse; its middle is half way between the rays that touch the sphere."""
     sphere = np.array([[300.0, 0.0, 0.0], [0.0, -200.0, 0.0], [0.0, 0.0, 0.0]])
-    shift = view().shadow_shift(sphere, np.full(3, 40.0))  # 20 mm at 1 m
+    shift = view().shadow_shift(sphere, np.full(3, 40.0))  # diameter 40 mm, distance 1 m
     for row, (column, away) in enumerate(((0, 300.0), (1, -200.0))):
         angle = np.arctan(away / 1000)
         wide = np.arcsin(20 / np.hypot(away, 1000))
@@ -65,7 +65,7 @@ def test_shadow_of_a_sphere_lies_farther_out_than_its_centre():
 
 
 def test_shadow_is_shifted_where_the_distortion_bends():
-    """By r^2 (3 u_xx + u_yy + 2 v_xy) / 8, which a stretch of the image does not do."""
+    """The shift is r^2 (3 u_xx + u_yy + 2 v_xy) / 8; a stretch of the image causes none."""
     half = 512.0
     stretch = np.array([[5.0, 3, 0, 0, 0], [2.0, -4, 0, 0, 0]])
     bends = np.array([[0.0, 0, 7.0, 0, -2], [0.0, 0, 0, 5.0, 0]])  # x^2, x y, y^2
@@ -216,7 +216,7 @@ def test_chance_of_a_wrong_centre_is_that_of_errors_with_such_a_residual():
     sigma, scatter = 0.2, 0.12
     error = rng.normal(0, sigma, (4_000_000, 2))
     residual = np.linalg.norm(error - rng.normal(0, scatter, error.shape), axis=1)
-    # Farther off than one in a thousand are.
+    # Beyond the distance that one error in a thousand exceeds.
     is_wrong = np.linalg.norm(error, axis=1) > sigma * np.sqrt(2 * np.log(1000))
     assert is_wrong.mean() == pytest.approx(1e-3, rel=0.1)
     places = np.array([0.3, 0.7, 0.9])
@@ -242,7 +242,7 @@ def test_bead_that_is_likely_half_a_pixel_off_is_not_observed(scatter, is_kept):
     measured = extraction._Measured(
         np.arange(n), beads, [None] * n, predicted, np.full(n, scatter)
     )
-    # By its standard deviation, it may be where its neighbours say.
+    # The residual is within the limit of its own standard deviation.
     assert extraction.RESIDUAL_SIGMAS * np.hypot(0.05, 0.12) > 0.5
     found = extraction._checked(None, None, None, measured, 'imaging')
     assert (4 in found.bead) is is_kept and len(found.bead) == n - 1 + is_kept
@@ -314,7 +314,7 @@ def test_doubts_are_of_pairs_and_begin_with_the_first():
 
 
 def test_marker_that_shares_the_way_of_the_others_is_no_other_shadow():
-    """After some way, counted in frames; one that moves alone is told after two images."""
+    """SHARED_PX in common confirm it; one that moves alone is reported after two images."""
     rows = np.arange(3)
     doubtful = np.array([True, False, True])
     ratio = np.array([0.0, 99.0, 0.0])
@@ -349,7 +349,7 @@ def test_marker_of_unknown_velocity_follows_those_beside_it():
 
 
 def two_herds():
-    """Twelve markers of two bodies that move differently, compared for some images."""
+    """Return twelve markers of two bodies that move differently, compared for some images."""
     one = motion(12)
     one.velocity[:] = np.where(np.arange(12)[:, None] % 2, [8.0, 0.0], [0.0, 3.0])
     for _ in range(6):
@@ -358,7 +358,7 @@ def two_herds():
 
 
 def test_marker_that_is_not_seen_follows_those_that_move_alike():
-    """The change of the velocities of its own body, not of all, nor of those not settled."""
+    """It adopts the change of velocity of its own body, not of all markers or unsettled ones."""
     one = two_herds()
     own = np.arange(12) % 2 == 0
     assert (one.together[0, 1:] == 6).all()
@@ -381,7 +381,7 @@ def test_marker_that_is_not_seen_follows_those_that_move_alike():
 
 
 def test_what_moves_alike_is_learned_from_sure_markers():
-    """A mean of the first differences, which then forgets a tenth with each image."""
+    """The first squared differences are averaged; later, each image replaces a tenth."""
     one = motion(6)
     sure = np.arange(6) != 5
     squares = []
@@ -408,7 +408,7 @@ def test_marker_that_leaves_its_body_is_strange():
     np.testing.assert_allclose(ratio[rows == 3], 36 / UNSTEADY_PX**2)
     np.testing.assert_allclose(ratio[rows != 3], usual[rows != 3], atol=1e-12)
     assert not len(one.strangeness(np.arange(12) < 4)[0])
-    # Those that were compared in few images tell nothing.
+    # Markers that were compared in too few images are not judged.
     one.together[:] = 4
     assert (one.strangeness(np.ones(12, bool))[1] == 0).all()
 
@@ -433,7 +433,7 @@ def test_places_are_taken_in_as_by_a_kalman_filter():
 
 
 def test_shadows_are_assigned_at_the_largest_likelihood():
-    """Against all permutations; as many markers as possible get one."""
+    """The reference is the best of all permutations; as many markers as possible get a shadow."""
     rng = np.random.default_rng(4)
     uv = rng.uniform(0, 20, (5, 2))
     found = uv[[2, 0, 4, 1]] + rng.normal(0, 2.0, (4, 2))
@@ -450,7 +450,7 @@ def test_shadows_are_assigned_at_the_largest_likelihood():
 
 
 def test_markers_vote_for_a_shift_in_common():
-    """Most of those beside a marker find a shadow there; the smaller one of two alike."""
+    """Most neighbours find a shadow at the common shift; of two such shifts the smaller wins."""
     uv = np.array([[100.0, 100.0], [120, 100], [100, 130], [140, 140], [170, 90]])
     beside = np.array([1, 2, 3, 4])
     others = np.array([[104.0, 96.0], [500, 500]])
@@ -472,10 +472,10 @@ def test_pairs_of_markers_are_doubtful_where_an_exchange_is_as_likely():
     measured = np.array([True, True, True, False])
     found = uv + [[1.0, 0], [-1.0, 0], [0, 0], [0, 0]]
     pairs = doubtful_pairs(uv, variance, measured, found, 1.6)
-    # Exchanged: 2 (2^2 - 1^2) / 4 more.
+    # The exchange costs 2 (2^2 - 1^2) / 4 more.
     assert pairs.tolist() == [[0, 1]]
     assert doubtful_pairs(uv, variance, measured, found, 1.4).tolist() == []
-    # The place of the second may be that of the fourth: (4^2 - 1^2) / 4 more.
+    # The second shadow may be that of the fourth marker: (4^2 - 1^2) / 4 more.
     assert doubtful_pairs(uv, variance, measured, found, 3.9).tolist() == [[0, 1], [1, 3]]
 
 
@@ -516,7 +516,7 @@ def test_states_of_markers_are_exchanged_and_taken_in_together():
 
 
 def test_lost_markers_are_shifted_together_with_the_velocity_that_they_have():
-    """Or with that of the shift, where it is not known; those that are sure stay."""
+    """If their velocity is unknown, they get that of the shift; sure markers stay in place."""
     one = motion(6)
     one.uv[:] = [[100.0, 100], [130, 100], [100, 140], [150, 150], [120, 170], [400, 400]]
     one.covariance[:4, 0, 0] = 17.0**2  # lost
@@ -536,7 +536,7 @@ def test_lost_markers_are_shifted_together_with_the_velocity_that_they_have():
 
 
 def test_a_marker_among_those_of_another_bone_is_shifted_with_its_own():
-    """Of two bones that overlap, the four nearest markers are of the other one."""
+    """The bones overlap: the four nearest markers belong to the other bone."""
     own = np.array([[100.0, 100], [130, 80], [60, 120], [110, 150], [90, 60]])
     other = np.array([[112.0, 101], [89, 97], [103, 113], [98, 86]])
     start = Motion.start(np.concatenate([own, other]), 4.0)

@@ -85,7 +85,7 @@ def beads(count=60, seed=2):
 
 
 def stepped(view, step):
-    """The view after a step of its unknowns, without the limits of a step."""
+    """Return the view after a step of its unknowns, without limiting the step."""
     return replace(
         view,
         position=view.position + step[:3],
@@ -121,7 +121,7 @@ def test_distortion_stays_beyond_one_and_a_half_of_the_image():
 
 
 def test_a_view_is_fitted_with_the_weight_of_what_is_expected():
-    """Dense: robust weights, and what is known of distance and coefficients."""
+    """The dense solution has robust weights, and priors of distance and coefficients."""
     lens = replace(LENS, coefficients=np.full((2, 5), 2.0), certainty=0.5)
     view, xyz = some_view(2, lens=lens), beads()
     true = stepped(view, np.r_[0.5, -0.3, 1.0, 2e-3, -1e-3, 1e-3, 2e-3, np.full(10, 0.5)])
@@ -212,7 +212,7 @@ def test_what_other_images_show_of_a_fluoroscope_helps_with_the_next():
 
 @pytest.mark.parametrize('blur', [False, True])
 def test_noise_of_an_image_is_that_of_its_pixels(blur):
-    """A ramp of light whose noise grows with it; correlated along the rows, too."""
+    """The noise of a ramp of light grows with the light; one case is correlated along the rows."""
     rng = np.random.default_rng(4)
     light = np.tile(np.linspace(100, 900, 400), (300, 1))
     white = rng.normal(size=light.shape)
@@ -237,7 +237,7 @@ def test_variance_is_that_of_rounding_at_least():
 
 
 def test_differences_see_a_part_of_correlated_noise():
-    """Second differences both ways, by the covariance of the pixels."""
+    """The expected value follows from the covariance of pixels in second differences both ways."""
     lags = np.arange(-2, 3)
     correlation = np.exp(-np.abs(lags))[:, None] * np.exp(-0.5 * np.abs(lags))
     kernel = np.array([1.0, -2.0, 1.0])
@@ -275,7 +275,7 @@ def test_clipped_values_are_more_frequent_than_those_beside():
 
 
 class Discs(ShadowFit):
-    """A fit whose model is linear: a plane, and three given functions of each bead."""
+    """A fit with a linear model: a plane, and three given functions of each bead."""
 
     def _model(self, rows, near):
         g, k = near.shape
@@ -311,7 +311,7 @@ def fit_of(count=3, near=None):
 
 @pytest.mark.parametrize('count', [12, 200])
 def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image(count):
-    """What is left has the noise of what was given, in usual windows and in others."""
+    """What remains has the variance of the noise, in usual windows and in others."""
     rng = np.random.default_rng(9)
     place = rng.uniform(0, 1000, (count, 2))
     x, y = (place.T - 500) / 500
@@ -329,7 +329,7 @@ def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image
     assert not np.stack(left)[:, ~valid].any()
     variance = np.mean(np.square(left), axis=(0, 2)) / valid.mean(axis=1)
     many = count > 100
-    # What a few windows do not tell of it is left; without it, there is 4 times the noise.
+    # A few windows leave part of the common pattern; without a correction the variance would be 4.
     assert np.mean(variance[usual]) == pytest.approx(1, abs=0.05 if many else 0.5)
     assert np.mean(variance[~usual]) == pytest.approx(1, abs=0.05 if many else 1.0)
     noise_alone = [
@@ -342,7 +342,7 @@ def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image
 
 
 def test_correlation_of_the_noise_is_the_smaller_one_of_windows_and_background():
-    """Both contain more than the noise: what the model lacks, shadows of other beads."""
+    """Each contains more than the noise: lack of fit in windows, other beads in the background."""
     fit = fit_of(40)
     rng = np.random.default_rng(12)
     white = rng.normal(size=(40, len(fit.offset)))
@@ -357,7 +357,7 @@ def test_correlation_of_the_noise_is_the_smaller_one_of_windows_and_background()
     fit.noise = Noise(4.0, 0.0, background)
     assert fit._correlation(white, valid).sum() < 1.2
     assert fit._correlation(correlated, valid) is background
-    # Too few pixels tell nothing.
+    # Too few pixels give no estimate.
     assert fit._correlation(white[:2], valid[:2]) is background
 
 
@@ -485,7 +485,7 @@ def test_a_profile_is_fitted_to_what_it_absorbs():
     assert true.reach_px == pytest.approx(5.0 + 3.2 * 1.2)
 
 
-# ---- what a phantom looks like from another side
+# ---- views of a phantom from other sides
 
 
 def test_a_cube_is_turned_in_24_ways():
@@ -496,7 +496,7 @@ def test_a_cube_is_turned_in_24_ways():
 
 
 def test_symmetries_take_beads_to_beads():
-    """Of a box of beads, shifted and turned: about all of its axes, and by its steps."""
+    """A shifted and turned box of beads is symmetric about all its axes and by its steps."""
     axis = np.arange(4.0)
     box = np.stack(np.meshgrid(10 * axis, 10 * axis[:3], 10 * axis[:3], indexing='ij'), -1)
     turn = Rotation.from_rotvec([0.2, 0.5, -0.1])
@@ -530,7 +530,7 @@ def test_regular_phantoms_are_flat_grids():
 
 
 def found_match(number, scale_px, beads_of=40, turn=0):
-    """A match of some beads whose score is about their number."""
+    """Return a match of `number` beads, whose score is about that number."""
     bead = (np.arange(number) + turn) % 60
     return Match(
         Fake(),
@@ -622,7 +622,7 @@ def test_seeds_begin_in_the_middle_and_go_on_with_beads_apart():
 
 
 def test_borders_of_shadows_are_those_of_the_cones_that_touch_spheres():
-    """Of a wide view with a distortion; the borders are projected ray by ray."""
+    """The wide view has a distortion; the expected borders are projected ray by ray."""
     lens = Lens((1000, 1000), 1200.0)
     coefficients = np.zeros((2, len(exponents(3))))
     coefficients[:, 5:] = [[20.0, 0.0, 20.0, 0.0], [0.0, 20.0, 0.0, 20.0]]
@@ -648,7 +648,7 @@ def test_borders_of_shadows_are_those_of_the_cones_that_touch_spheres():
 
 
 def test_beads_of_several_sizes_tell_attenuation_from_scattered_light():
-    """Those of one size hardly do: a harder edge with a wider blur looks alike."""
+    """Beads of one size hardly do: a sharper edge with a wider blur looks alike."""
     true = Profile(5.0, 1.2, 0.8, 0.1)
     rng = np.random.default_rng(11)
     size = rng.choice([0.7, 1.0, 1.4], 12000)
@@ -659,7 +659,7 @@ def test_beads_of_several_sizes_tell_attenuation_from_scattered_light():
         share[own] = (1 - true.scatter) * true.sized(one).shadow(distance[own])[0]
     share += rng.normal(0, 0.01, 12000)
     found = Profile(4.5, 1.0, 1.5, 0.1)
-    for _ in range(4):  # of a few steps each
+    for _ in range(4):  # each call makes a few steps only
         found = fit_profile(Absorbed(distance, share, np.ones(12000), size), found)
     assert found.radius_px == pytest.approx(5.0, abs=0.03)
     assert found.attenuation == pytest.approx(0.8, abs=0.05)
@@ -667,7 +667,7 @@ def test_beads_of_several_sizes_tell_attenuation_from_scattered_light():
 
 
 def test_noise_that_is_blurred_is_correlated_in_two_directions_as_well():
-    """A blur of half a pixel: a correlation of .27 along the rows, .07 across both."""
+    """A blur of half a pixel: a correlation of 0.27 along the rows, and of 0.07 diagonally."""
     rng = np.random.default_rng(12)
     noise = cv2.GaussianBlur(rng.normal(size=(1, 300, 300))[0], (0, 0), 0.5)[None]
     found = correlation_of(noise, np.ones(noise.shape))

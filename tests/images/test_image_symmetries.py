@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An image that is transposed, mirrored, turned round in its light or brighter shows the same."""
+"""A transposed, mirrored, inverted or brighter image gives the same results."""
 
 import functools
 from types import SimpleNamespace as Fake
@@ -40,7 +40,7 @@ SHAPE = (150, 230)
 
 @functools.cache
 def scene(radius=RADIUS_PX, seed=4):
-    """Image (h, w) of uint16 with dark spheres, two of which touch, in light that declines."""
+    """Return an image (h, w) of uint16: dark spheres, two of which touch, in a ramp of light."""
     fine = 4
     v, u = (np.mgrid[: fine * SHAPE[0], : fine * SHAPE[1]] + 0.5) / fine - 0.5
     light = 900.0 - 1.5 * u + 0.8 * v
@@ -73,7 +73,7 @@ def test_beads_are_found_in_the_transposed_and_the_mirrored_image(look):
     assert 0.6 * RADIUS_PX < found.radius_px < RADIUS_PX + BLUR_PX
     turned = detect_beads(np.ascontiguousarray(image.T), 12, look)
     off = np.abs(in_order(swapped(turned.uv)) - in_order(found.uv))
-    assert np.median(off) == 0 and off.max() <= 1  # of discs that overlap, to a pixel
+    assert np.median(off) == 0 and off.max() <= 1  # one pixel off for discs that overlap
     assert sorted(turned.strength) == pytest.approx(sorted(found.strength), rel=1e-3)
     assert turned.radius_px == pytest.approx(found.radius_px, rel=1e-6)
     np.testing.assert_allclose(turned.noise.correlation, found.noise.correlation.T, atol=1e-5)
@@ -212,7 +212,7 @@ def test_an_image_says_itself_whether_its_markers_are_bright():
 
 @pytest.mark.parametrize('is_bright', [False, True])
 def test_markers_are_told_from_noise_that_is_stronger_where_there_is_less_light(is_bright):
-    """The light of bright markers is what dark ones leave below the largest grey value."""
+    """The light of bright markers is the largest grey value minus that of dark markers."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     light = np.full(SHAPE, 57000.0)
     for x, y in PLACES:
@@ -246,7 +246,7 @@ def test_windows_are_read_as_the_image_is_beyond_its_edges_too():
 
 
 def test_windows_show_the_shadows_that_the_whole_image_has_there():
-    """Each once, wherever it is in one or in two windows."""
+    """Each shadow is found once, whether it is in one window or in two."""
     image = scene()
     look = look_of(image)
     whole = search_image(image, look)
@@ -262,7 +262,7 @@ def test_windows_show_the_shadows_that_the_whole_image_has_there():
     transposed = np.ascontiguousarray(image.T)
     look = look_of(transposed)
     turned = search_windows(LightWindows(transposed, look), middle[:, ::-1], 12, look)
-    # The light around a pixel is that along the rows.
+    # The light around a pixel is estimated along the rows.
     np.testing.assert_allclose(in_order(swapped(turned.uv)), in_order(found.uv), atol=0.25)
 
 
@@ -378,8 +378,8 @@ def test_markers_that_may_be_anywhere_are_not_searched_in_windows():
 
 @pytest.mark.parametrize('edge', range(4))
 def test_shadows_in_the_middle_of_which_the_image_ends_are_not_found(edge):
-    """The others are. The edge is on the left, below, on the right and above."""
-    left = scene()[:, 40:]  # through the fourth marker
+    """All others are found. The edge is on the left, below, on the right and above in turn."""
+    left = scene()[:, 40:]  # the new edge cuts the fourth marker
     cut = np.ascontiguousarray(np.rot90(left, edge))
     there = (PLACES - [40, 0])[PLACES[:, 0] > 50]
     for _ in range(edge):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The shadow of a typical bead, and the sizes of all, are told by an image."""
+"""An image determines the shadow of a typical bead and the sizes of all beads."""
 
 from dataclasses import replace
 
@@ -25,13 +25,13 @@ from fluoro_calib_ros.images.measurement import (
 )
 from fluoro_calib_ros.images.shadow_fit import Profile
 
-FINE = 4  # points across a pixel
+FINE = 4  # grid points per pixel, along each axis
 PITCH = 60
-ABSORBED = 0.1  # along a pixel of steel
+ABSORBED = 0.1  # share of the light per pixel of steel
 
 
 def image_of(radii: np.ndarray, blur_px: float, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Radiograph (h, w) of spheres of some radii [px], and their centres (n, 2) [px]."""
+    """Return a radiograph (h, w) of spheres with radii [px], and their centres (n, 2) [px]."""
     rng = np.random.default_rng(seed)
     across = int(np.ceil(np.sqrt(len(radii))))
     size = PITCH * across
@@ -51,7 +51,7 @@ def image_of(radii: np.ndarray, blur_px: float, seed: int = 5) -> tuple[np.ndarr
 def completed(
     radii: np.ndarray, size: np.ndarray | None, radius_px: float, blur_px: float = 1.2
 ) -> tuple[Imaging, Light, np.ndarray]:
-    """What an image of spheres tells, the image, and the centres of the spheres."""
+    """Return the imaging estimated from an image of spheres, the image, and the true centres."""
     image, uv = image_of(radii, blur_px)
     light = Light(image, np.ones(image.shape, bool))
     n = len(uv)
@@ -100,7 +100,7 @@ def test_profile_of_small_shadows_that_move_is_an_estimate():
 @pytest.mark.parametrize('radius_px', [5.5, 8.0])
 @pytest.mark.parametrize('others', [[8.0, 8.0, 10.5], [5.5, 8.0, 10.5]])
 def test_sizes_that_are_not_told_are_seen(radius_px, others):
-    """A first profile of beads of all sizes fits few of them."""
+    """The first profile, which is of beads of all sizes, fits few of them."""
     radii = np.tile([5.5, *others], 4)
     imaging, *_ = completed(radii, None, radius_px)
     size = imaging.size / np.median(imaging.size[radii == 8])
@@ -165,7 +165,7 @@ def test_centres_in_a_compressed_image_are_as_good_as_their_sigma():
 
 def test_something_beside_a_few_beads_is_no_other_size():
     image, uv = image_of(np.full(36, 8.0), 1.2)
-    image[40:, :60] *= 0.8  # the edge of a plate, across the first beads of the rows
+    image[40:, :60] *= 0.8  # the edge of a plate, across the first bead of each row
     light = Light(image, np.ones(image.shape, bool))
     shadows = Expected(
         np.arange(36), uv, circles(np.ones(36)), np.ones(36, bool), np.ones(36, bool)
@@ -190,7 +190,7 @@ def test_field_of_view_goes_on_beyond_a_plate_and_ends_before_letters():
 def measured_in(
     image: np.ndarray, uv: np.ndarray, size: np.ndarray, radius_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (n, 2) of centres and their standard deviations (n,) [px], sizes (n,) being told."""
+    """Return errors (n, 2) and standard deviations (n,) of centres [px] for given sizes (n,)."""
     n = len(uv)
     light = Light(image, np.ones(image.shape, bool))
     noise = estimate_noise(image, light.field)
@@ -203,7 +203,7 @@ def measured_in(
 
 
 def test_what_all_shadows_have_in_common_is_no_noise():
-    """Holes of a thick plate that is tilted: two discs, one for each face."""
+    """The shadows are holes of a thick, tilted plate: two discs each, one for either face."""
     off = []
     rng = np.random.default_rng(7)
     across, count = 8, 64
@@ -226,7 +226,7 @@ def test_what_all_shadows_have_in_common_is_no_noise():
 
 
 def test_window_of_a_bead_is_not_that_of_the_largest():
-    """The edge of a plate lies 14 px beside small beads, and within the window of large ones."""
+    """The edge of a plate is 14 px from small beads, which is inside the window of large ones."""
     radii = np.full(36, 6.0)
     radii[-3:] = 12.0  # not in the first column
     image, uv = image_of(radii, 1.2)
@@ -238,7 +238,7 @@ def test_window_of_a_bead_is_not_that_of_the_largest():
 
 
 def sizes_of(count=5, others=()):
-    """Comparison of the sizes of beads in a row, whose lack of fit is a function of them."""
+    """Return the comparison of sizes of beads in a row; its lack of fit may be replaced."""
     uv = np.vstack([100.0 * np.arange(count)[:, None] * [1, 0], *others])
     n = len(uv)
     shadows = Expected(np.arange(n), uv, circles(np.ones(n)), np.ones(n, bool), np.ones(n, bool))
@@ -258,13 +258,13 @@ def test_size_is_where_the_fit_is_best_to_a_part_of_a_step(monkeypatch):
     )
     found = sizes.best(np.arange(5))
     np.testing.assert_allclose(found, true, rtol=1e-6)
-    # Beyond the sizes that are compared, there is no parabola.
+    # For a true size outside the compared range, there is no parabola to interpolate.
     true[0] = 0.2
     assert 0.3 < sizes.best(np.arange(5))[0] < 0.5
 
 
 def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
-    """Those whose shadows the windows may show, with the sizes that they have."""
+    """The windows include the neighbouring shadows that they may show, with their known sizes."""
     asked = []
 
     class Fit:
@@ -277,7 +277,7 @@ def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
             pass
 
     monkeypatch.setattr('fluoro_calib_ros.images.measurement._BeadFit', Fit)
-    reach = (1.6 + 2.0) * (5.0 + 3.2)  # of the largest size that is compared, and that is known
+    reach = (1.6 + 2.0) * (5.0 + 3.2)  # of the largest compared and the known size
     others = np.array([[0.0, 0.99 * reach], [0.0, 1.01 * reach], [100.0, -0.99 * reach]])
     sizes = sizes_of(2, others)
     found = sizes.lacks(np.array([0, 1]), [np.array([0.5, 0.6]), np.array([1.5, 1.6])])
@@ -290,7 +290,7 @@ def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
 @pytest.mark.parametrize(
     ('common', 'own', 'share', 'is_equal'),
     [
-        (1.5, 1.0, 1.0, True),  # less than what something beside a bead does
+        (1.5, 1.0, 1.0, True),  # below the effect of a neighbouring object
         (1.7, 1.0, 0.2, True),
         (1.7, 1.0, 0.3, False),
         (1.7, 1.2, 0.3, True),  # their own size fits hardly better
@@ -322,7 +322,7 @@ NOISE = Noise(1.0, 0.0, np.ones((1, 1)))
 
 
 def test_windows_at_the_edge_of_an_image_have_the_pixels_that_are_there():
-    """Beads of which a third is beyond the image or its field, or whose edge is, are not used."""
+    """Beads are unused if a third is beyond the image or field, or if their edge is."""
     shape = (60, 80)
     grey = np.random.default_rng(3).uniform(100, 200, shape).astype(np.float32)
     field = np.ones(shape, bool)
@@ -338,7 +338,7 @@ def test_windows_at_the_edge_of_an_image_have_the_pixels_that_are_there():
             assert fit.valid[row, k] == bool(there and field[v + dv, u + du])
             if there:
                 assert fit.grey[row, k] == grey[v + dv, u + du]
-    # The edge of a shadow, 4 px from its centre, lies within the image.
+    # The edge of the shadow, 4 px from its centre, has to lie within the image.
     expected = np.minimum(uv, np.array([79, 59]) - uv).min(axis=1) >= 4.0
     assert fit.usable.tolist() == expected.tolist()
 
@@ -362,7 +362,7 @@ def test_neighbours_are_those_within_reach_the_nearest_first():
 
 
 def test_windows_of_beads_that_look_larger_are_larger():
-    """By their place in the image, and by their own size."""
+    """They depend on the place in the image and on the size of the bead."""
     uv = np.array([[50.0, 50], [150, 50], [250, 50], [350, 50]])
     light = Light(np.full((100, 400), 100.0, np.float32), np.ones((100, 400), bool))
     profile = Profile(5.0, 1.0, 1.0)
@@ -383,7 +383,7 @@ RADIUS = 8.0
 
 
 def radiograph_of_pairs(scatter: float, photons: float = 300) -> tuple[np.ndarray, Expected]:
-    """Radiograph (h, w) of 20 spheres alone and 16 in pairs, in scattered light, and shadows."""
+    """Return a radiograph (h, w) with scatter, and shadows: 20 spheres alone and 16 in pairs."""
     rng = np.random.default_rng(3)
     row, column = np.divmod(np.arange(28), 6)
     place = PITCH * (np.column_stack([column, row]) + 0.5) + rng.uniform(-3, 3, (28, 2))
@@ -420,7 +420,7 @@ def test_shadows_that_overlap_tell_the_scattered_light(scatter, photons):
 def test_scattered_light_stays_where_shadows_are_not_those_of_spheres():
     image, shadows = radiograph_of_pairs(0.3)
     v, u = np.indices(image.shape)
-    for x, y in shadows.uv:  # spheres with a hole
+    for x, y in shadows.uv:  # make the spheres look as if they had a hole
         image += 200 * np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 1.5**2).astype(np.float32)
     light = Light(image, np.ones(image.shape, bool))
     noise = estimate_noise(image, light.field)
@@ -429,7 +429,7 @@ def test_scattered_light_stays_where_shadows_are_not_those_of_spheres():
 
 
 def test_light_behind_two_beads_changes_with_the_scattered_light():
-    """Shadows of single beads stay: what they absorb of the direct light grows with its loss."""
+    """Shadows of single beads do not change: the depth compensates the loss of direct light."""
     image, shadows = radiograph_of_pairs(0.2)
     light = Light(image, np.ones(image.shape, bool))
     profile = Profile(RADIUS, 1.2, ABSORBED * RADIUS, 0.2)
@@ -446,7 +446,7 @@ def test_light_behind_two_beads_changes_with_the_scattered_light():
     fit.depth *= 0.8 / (0.8 - change)
     fit._cross()
     after, _ = fit._model(rows, near)
-    # Shadows that touch are blurred on a grid of three points across a pixel.
+    # The tolerance allows for the blur of touching shadows on three grid points per pixel.
     np.testing.assert_allclose((after - before) / change, slope, atol=0.02 * np.abs(slope).max())
     assert np.abs(slope).max() > 30
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Residuals of beads are those of their neighbours in the image, with honest deviations."""
+"""Interpolated residuals of beads agree with their neighbours, with realistic deviations."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ LENGTH_PX = 250.0
 
 
 def residuals(seed: int, noise: float, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
-    """Places (n, 2), and a smooth field there with noise."""
+    """Return places (n, 2) and values of a smooth field with noise there."""
     rng = np.random.default_rng(seed)
     place = rng.uniform(0, 1000, (count, 2))
     x, y = place.T / 1000

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Flat grids in images: numbered along rows and columns, also where they are bent."""
+"""Flat grids in images are numbered along rows and columns, even if these are curved."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def grid(steps: np.ndarray, count: int = 15, missing: int = 0) -> np.ndarray:
 
 
 def pixels(xyz: np.ndarray, tilt: tuple[float, float, float]) -> np.ndarray:
-    """Pixels with a pincushion of 30 px at the rim; NaN outside of the image."""
+    """Return pixels with a pincushion distortion of 30 px at the rim; NaN outside the image."""
     x = xyz @ matrix_from_vector(tilt).T + (4.0, -6.0, 1000.0)
     ideal = 4000 * x[:, :2] / x[:, 2:]
     uv = ideal * (1 + 0.06 * np.sum((ideal / 512) ** 2, axis=1, keepdims=True)) + 511.5
@@ -64,13 +64,13 @@ def test_a_grid_with_missing_beads_is_told_from_its_symmetries(steps, tilt):
 
 @pytest.mark.long
 def test_a_regular_grid_is_ambiguous_unless_any_place_will_do():
-    xyz = grid(SQUARE, 27)  # reaches beyond the image
+    xyz = grid(SQUARE, 27)  # extends beyond the image
     seen = seen_of(pixels(xyz, (0.2, 0.1, 0.5)))
     with refused(Kind.POSE_AMBIGUOUS):
         match(seen, PhantomModel.of(xyz), LENS)
     found = match(seen, PhantomModel.of(xyz, regular=True), LENS)
     assert len(found.bead) > 0.97 * len(seen.uv)
-    # Whichever place it is: beads that are neighbours in the image are so in the grid.
+    # The place is arbitrary, but beads that are neighbours in the image are so in the grid.
     _, near = seen.tree.query(seen.uv[found.detection], k=2)
     row = np.full(len(seen.uv), -1)
     row[found.detection] = found.bead
@@ -83,7 +83,7 @@ def test_a_regular_grid_is_ambiguous_unless_any_place_will_do():
 @pytest.mark.parametrize('blocked', [1, 2, 5])
 def test_blocked_holes_tell_where_a_sheet_is(steps, blocked):
     every = grid(steps)
-    # The first mark lies on no axis of symmetry: from behind, the sheet looks otherwise.
+    # The first mark lies on no axis of symmetry, so that the sheet looks different from behind.
     order = np.argsort(np.linalg.norm(every - (21.0, 9.0, 0.0), axis=1))
     xyz = np.delete(every, order[:blocked], axis=0)
     true = pixels(xyz, (0.1, -0.05, 2.0))
@@ -95,7 +95,7 @@ def test_blocked_holes_tell_where_a_sheet_is(steps, blocked):
 
 
 def with_responses(seen: Seen, true: np.ndarray, enlarged: list[int]) -> Seen:
-    """What is found of a sheet, with the responses to its holes: they scatter most at its rim."""
+    """Return the detections with the responses to the holes, which scatter most at the rim."""
     response = np.random.default_rng(5).normal(0, 0.04, len(true))
     place = np.arange(len(true))
     rim = np.isin(place // 13, (0, 12)) | np.isin(place % 13, (0, 12))
@@ -147,7 +147,7 @@ def test_a_sheet_without_mark_is_indexed_from_the_middle():
     spacing = float(np.median(seen.tree.query(seen.uv, k=[2])[0]))
     assert np.linalg.norm(xyz[centre]) == 0
     assert np.linalg.norm(at - LENS.centre) < 0.7 * spacing
-    # Upright: what is to the right in the sheet is so in the image.
+    # Upright: what is on the right in the sheet is on the right in the image.
     assert np.corrcoef(xyz[found.bead, 0], seen.uv[found.detection, 0])[0, 1] > 0.8
 
 
@@ -165,7 +165,7 @@ def test_scattered_points_have_no_lattice():
 
 @pytest.mark.parametrize('turn', [(0.0, 0.0, 0.0), (0.4, 1.9, -0.7), (2.2, 0.1, 0.9)])
 def test_a_grid_is_told_whatever_the_frame_of_its_survey_is(turn):
-    """Its axes are those of the beads, not of the frame."""
+    """The axes used are those of the beads, not of the frame."""
     xyz = grid(np.array([[10.0, 0.0], [0.0, 16.0]]), 11, missing=9)
     true = pixels(xyz, (0.2, -0.3, 0.4))
     seen = seen_of(true)
@@ -196,7 +196,7 @@ def test_a_grid_that_is_told_by_its_first_pose_is_not_fitted_elsewhere(monkeypat
     true = pixels(xyz, (0.2, -0.1, 0.7))
     found = match(seen_of(true), PhantomModel.of(xyz), LENS)
     assert len(found.bead) > 0.9 * np.isfinite(true[:, 0]).sum() and len(fitted) == 1
-    # Of poses with as much against them, those fit that are turned.
+    # With irregular places, few poses are fitted.
     fitted.clear()
     xyz[:, :2] = (grid(SQUARE, 21) + rng.uniform(-1.5, 1.5, (441, 3)))[: len(xyz), :2]
     match(seen_of(pixels(xyz, (0.2, -0.1, 0.7))), PhantomModel.of(xyz), LENS)
@@ -204,7 +204,7 @@ def test_a_grid_that_is_told_by_its_first_pose_is_not_fitted_elsewhere(monkeypat
 
 
 def test_a_lattice_of_unlike_steps_is_numbered_around_its_gaps():
-    """Something beside it, nearer than its long step is, is no place of it."""
+    """A point next to it, nearer than the long step, does not become a place of the lattice."""
     place = np.array([(i, j) for i in range(9) for j in range(6)])
     place = place[~((place[:, 0] == 4) & (place[:, 1] < 4))]
     points = place * [10.0, 45.0]

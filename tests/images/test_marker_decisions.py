@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Decisions on doubtful ids, exposure by exposure, and what they are made from."""
+"""Decisions on doubtful ids, exposure by exposure, and the evidence for them."""
 
 from types import SimpleNamespace as Fake
 
@@ -36,7 +36,7 @@ RNG = np.random.default_rng(17)
 
 
 class Tracker:
-    """Doubts of a tracker, by id, and what it was told to do."""
+    """Doubts of a tracker by id, and the instructions that it received."""
 
     def __init__(self):
         self.doubts = MarkerDoubts(12)
@@ -75,7 +75,7 @@ def view():
 
 
 def exposure(seen, tracker, lack=None, sigma=0.1):
-    """What the second of two views sees."""
+    """Return an exposure as seen by the second of two views."""
     doubtful = np.isin(IDS, tracker.doubtful())
     lack = np.full(4, np.nan) if lack is None else np.asarray(lack, dtype=float)
     return Fake(
@@ -87,7 +87,7 @@ def exposure(seen, tracker, lack=None, sigma=0.1):
 
 
 def decided(decisions, one, seen, frames, place=PLACES, sd=0.05, sigma=0.1):
-    """Decisions of exposures in which the same is seen, as (kind, frame, since, ids)."""
+    """Return the decisions in exposures that see the same, as (kind, frame, since, ids)."""
     out = []
     for frame in frames:
         found = decisions.decide(
@@ -119,7 +119,7 @@ def test_counts_begin_with_the_first_exposure_that_agrees():
     counts.clear([1, 2])
     assert counts.wrong.tolist() == [0, 0, 0] and counts.agree(2, True, 7) == 1
     assert counts.confirm(2) == 7
-    # Exposures before a doubt say nothing of it.
+    # Exposures before a doubt do not count.
     assert [counts.agree(0, True, frame) for frame in (3, 4)] == [1, 2]
     assert [counts.agree(0, True, frame, began=8) for frame in (9, 10)] == [1, 2]
     assert counts.confirm(0) == 9
@@ -135,11 +135,11 @@ def test_an_id_is_confirmed_by_three_exposures_where_its_body_says():
 
 @pytest.mark.parametrize('began', [None, 18])
 def test_an_id_is_dropped_after_three_exposures_elsewhere(began):
-    """Since the doubt began, else since the first of the three."""
+    """It is dropped since the doubt began, otherwise since the first of the three."""
     one = view()
     if began:
         one.tracker.doubt(8, began)
-    seen = PLACES + (np.arange(4) == 2)[:, None] * [1.6, 0]  # 1.5 times the nearest px
+    seen = PLACES + (np.arange(4) == 2)[:, None] * [1.6, 0]  # just beyond the limit of 1.5 px
     found = decided(BodyDecisions(one), one, seen, range(21, 24))
     assert found == [('dropped', 23, began or 21, (8,))]
     assert one.tracker.told == [('forget', 8)] and not one.counts.wrong.any()
@@ -150,13 +150,13 @@ def test_an_id_is_dropped_after_three_exposures_elsewhere(began):
     [
         (0.99, 0.0, 0.0, False),
         (1.01, 0.0, 0.0, True),
-        (2.24, 0.3, 0.4, False),  # 4.5 deviations of both
+        (2.24, 0.3, 0.4, False),  # 4.5 deviations of both places
         (2.26, 0.3, 0.4, True),
         (np.nan, 0.0, 0.0, False),
     ],
 )
 def test_a_place_that_chance_does_not_explain_is_doubted_at_once(off, sd, sigma, is_doubted):
-    """And in its place for three images, it is confirmed."""
+    """After three images in its place, it is confirmed."""
     one = view()
     decisions = BodyDecisions(one)
     seen = PLACES + (np.arange(4) == 0)[:, None] * [0.0, off]
@@ -173,7 +173,7 @@ def test_a_place_that_chance_does_not_explain_is_doubted_at_once(off, sd, sigma,
         (1.01, 0.0, 0.0, []),
         (1.49, 0.0, 0.0, []),
         (1.51, 0.0, 0.0, ['dropped']),
-        (1.74, 0.3, 0.4, ['confirmed']),  # 3.5 deviations of both
+        (1.74, 0.3, 0.4, ['confirmed']),  # 3.5 deviations of both places
         (1.76, 0.3, 0.4, []),
         (2.62, 0.3, 0.4, []),
         (2.63, 0.3, 0.4, ['dropped']),
@@ -202,7 +202,7 @@ def test_an_id_stays_doubtful_where_another_could_be_as_well():
 
 @pytest.mark.parametrize(('doubted', 'since'), [(None, 23), (21, 23), (24, 24)])
 def test_ids_where_the_other_should_be_are_exchanged(doubted, since):
-    """Not before an exposure in which one of them was in its place."""
+    """The exchange is dated after the last exposure in which one of them was in its place."""
     one = view()
     decisions = BodyDecisions(one)
     assert decided(decisions, one, PLACES, [20, 22]) == []
@@ -271,7 +271,7 @@ def test_an_id_is_confirmed_by_eight_exposures_whose_rays_meet(lack, confirmed):
 
 
 def test_an_id_that_may_be_exchanged_is_not_confirmed_by_its_own_rays():
-    """Its partner is not seen here, but it may have the other's place."""
+    """Its partner is not seen in this view, but may have taken its place."""
     one = view()
     one.tracker.doubts.add_pair(5, 11, 12)
     assert not ray_decided(ray_decisions(one, []), one, [0, 0, 0, np.nan], range(20, 30))
@@ -286,7 +286,7 @@ def test_rays_that_do_not_belong_together_are_doubted(lack, is_doubted):
 
 
 def test_two_ids_are_exchanged_or_kept_by_the_sum_of_their_evidence():
-    """The evidence of an exposure is the difference of squares, of 50 at most each."""
+    """The evidence of an exposure is the difference of the squares, each at most 50."""
 
     def of(lack, exchanged):
         one = view()
@@ -294,14 +294,14 @@ def test_two_ids_are_exchanged_or_kept_by_the_sum_of_their_evidence():
         decisions = ray_decisions(one, exchanged)
         return one, ray_decided(decisions, one, [lack[0], 0, 0, lack[1]], range(20, 26))
 
-    one, found = of((1.0, 2.0), (4.0, 3.0))  # 25 - 5 each time
+    one, found = of((1.0, 2.0), (4.0, 3.0))  # 25 - 5 in each exposure
     assert found == [('confirmed', 22, 20, (3,)), ('confirmed', 22, 20, (11,))]
     assert one.tracker.told == [('part', 3, 11)]
     one, found = of((4.0, 3.0), (1.0, 2.0))
     assert found[0] == ('exchanged', 22, 12, (3, 11))
     assert found[1:] == [('confirmed', 22, 22, (3,)), ('confirmed', 22, 22, (11,))]
     assert one.tracker.told == [('exchange', 3, 11), ('part', 3, 11)]
-    one, found = of((3.0, 3.0), (9.0, np.nan))  # 100 - 18, at once
+    one, found = of((3.0, 3.0), (9.0, np.nan))  # more than 50 in one exposure
     assert [kind for kind, frame, *_ in found if frame == 20] == ['confirmed', 'confirmed']
     _, found = of((5.0, 5.0), (5.0, 5.0))
     assert found == []
@@ -315,11 +315,11 @@ def test_an_id_is_kept_since_the_exchange_was_last_as_likely():
     found = ray_decided(decisions, one, [2.0, 0, 0, 0], range(20, 24))
     assert [(frame, since) for _, frame, since, _ in found] == [
         (22, 21)
-    ] * 2  # 21 - 3 + 32: just 50
+    ] * 2  # the sum of the evidence just exceeds 50: 21 - 3 + 32
 
 
 def test_an_exposure_in_which_one_of_two_is_something_else_tells_nothing_of_their_exchange():
-    """Ids are confirmed since a later one."""
+    """The ids are confirmed since a later exposure."""
     one = view()
     one.tracker.doubts.add_pair(3, 11, 12)
     told = iter([(9.0, 0.0), (30.0, 5.0), (9.0, 0.0)])
@@ -348,12 +348,12 @@ def test_places_are_filled_and_go_on():
     before = MarkerPlaces(filled.xyz_mm - [[3.0, 0, 0], [0, 6, 0]], 4 * filled.covariance)
     moved = filled.moved_on(before, 0.5)
     np.testing.assert_allclose(moved.xyz_mm, [[2.5, 2, 3], [4, 8, 6]])
-    # (1 + s)^2 C + s^2 C0, and a third of the squared way along each axis.
+    # (1 + s)^2 C + s^2 C0, plus a third of the squared motion along each axis.
     np.testing.assert_allclose(moved.covariance[0], (2.25 + 1 + 0.75) * np.eye(3))
     np.testing.assert_allclose(moved.covariance[1], (4.5 + 2 + 3) * np.eye(3))
 
 
-# ---- motion beside other markers
+# ---- motion relative to neighbouring markers
 
 
 def moving(uv, velocity, sd=0.3, speed_sd=0.1):
@@ -376,7 +376,7 @@ def test_velocity_is_that_of_the_four_nearest_that_are_known():
     states.unseen[1] = 2
     assert velocity_beside(states, 0)[0].tolist() == [3.5, 0.0]
     states.motion.unlike[0, 5] = 1.0
-    assert velocity_beside(states, 0)[0].tolist() == [3.5, 0.0]  # that one is not seen
+    assert velocity_beside(states, 0)[0].tolist() == [3.5, 0.0]  # marker 1 is not seen
     states.motion.covariance[2, 1, 1] = 9.1
     assert velocity_beside(states, 0) is None  # three are left
     assert velocity_beside(states, 5) is None
@@ -389,9 +389,9 @@ def test_a_marker_of_unknown_velocity_is_where_those_beside_it_take_it():
     states = MarkerStates.start(motion, np.zeros(5, int))
     follow_beside(states, 3)
     assert motion.uv[0].tolist() == [3 * (2 - 1), -3] and motion.velocity[0].tolist() == [2, 0]
-    np.testing.assert_allclose(motion.covariance[0], 4 * np.eye(2))  # as they differ, 2 px
+    np.testing.assert_allclose(motion.covariance[0], 4 * np.eye(2))  # they differ by 2 px
     assert motion.uv[1:].tolist() == uv[1:]
-    # A place that is given is that of the present image.
+    # A place that has just been given refers to the present image and is not moved.
     motion.covariance[0, 1, 1] = 36.0
     states.placed[0] = 0
     before = motion.uv.copy()
@@ -410,7 +410,7 @@ def test_lost_markers_move_together_to_their_shadows():
     np.testing.assert_allclose(motion.velocity, [[2, 0], shift / 2, [2, 0], [2, 0], [2, 0]])
     np.testing.assert_allclose(motion.uv[4], uv[4])
     np.testing.assert_allclose(motion.covariance[0], 2.25 * np.eye(2))
-    for wide_sd, is_moved in ((10.6, False), (10.7, True)):  # a gate of 48 px
+    for wide_sd, is_moved in ((10.6, False), (10.7, True)):  # gates just below and above 48 px
         motion = moving(uv, [2.0, 0], sd=wide_sd)
         shift_together(seen_states(motion), Fake(uv=uv + shift), 4.5, 2)
         assert bool(np.allclose(motion.uv, uv + shift)) is is_moved
@@ -423,7 +423,7 @@ def test_lost_markers_move_together_to_their_shadows():
 
 
 def watched(found_uv, free=(), measured=None, unseen=0, variance=0.1, speed_sd=0.1, **changes):
-    """Watch, states and what was found of markers beside each other, with doubts by row."""
+    """Return watch, states, findings and doubts (by row) of neighbouring markers."""
     uv = np.array(changes.pop('uv', PLACES), dtype=float)
     motion = moving(uv, np.zeros(2), np.sqrt(variance), speed_sd)
     states = MarkerStates.start(motion, np.full(4, unseen))
@@ -445,7 +445,7 @@ def watched(found_uv, free=(), measured=None, unseen=0, variance=0.1, speed_sd=0
     [(1, 60.0, False), (2, 60.0, True), (2, 30.0, False), (2, 32.0, True)],
 )
 def test_a_marker_found_again_in_a_wide_gate_is_doubted(unseen, variance, is_doubted):
-    """0.02 false shadows are expected in a gate of 2000 px^2, of a variance of 31.4 px^2."""
+    """A gate of 2000 px^2, from a variance of 31.4 px^2, has 0.02 expected false shadows."""
     watch, states, found, doubts = watched(
         PLACES, measured=[True, False, False, False], unseen=unseen, variance=variance
     )
@@ -460,7 +460,7 @@ def test_a_marker_found_again_in_a_wide_gate_is_doubted(unseen, variance, is_dou
     ('away', 'own', 'is_doubted'), [(1.4, 0.0, True), (1.6, 0.0, False), (1.6, 0.7, True)]
 )
 def test_a_shadow_beside_a_marker_may_be_its_own(away, own, is_doubted):
-    """Squared distances over a variance of 0.1 + 0.25^2 px^2 may differ by 14: by 1.51 px."""
+    """Squared distances over a variance of 0.1 + 0.25^2 px^2 may differ by 14, that is 1.51 px."""
     watch, states, found, doubts = watched(
         PLACES + (np.arange(4) == 1)[:, None] * [own, 0], free=PLACES[1:2] - [0, away]
     )
@@ -499,7 +499,7 @@ def test_markers_whose_shadows_met_are_doubted_once_their_velocity_is_known():
     [
         (6, 0.1, 1.0, False, False),
         (7, 0.1, 1.0, True, True),
-        (7, 5.0, 1.0, True, True),  # one shadow, however fast they are
+        (7, 5.0, 1.0, True, True),  # one shadow, whatever the velocities
         (6, 5.0, 1.0, False, False),
         (7, 5.0, 5.1, True, False),
     ],
@@ -535,7 +535,7 @@ def found_frame(found):
 
 
 def test_ways_are_compared_over_images_and_begin_anew():
-    """A marker is alone with its second strange image; one that shared 15 px is confirmed."""
+    """The second strange image isolates a marker; 15 px in common confirm it."""
     company = MarkerCompany(3)
     velocity = np.array([[4.0, 0], [4.0, 1.3], [4.0, 1.5]])
     ratio = np.array([7.1, 7.0, 0.0])
@@ -545,7 +545,7 @@ def test_ways_are_compared_over_images_and_begin_anew():
     )
     doubtful = np.array([False, True, True])
     found = [company.compare(motion, None, doubtful, 2) for _ in range(3)]
-    # 8 px an image; differences of 0.33 and 0.38 of the way.
+    # 8 px per image; the differences are 0.33 and 0.38 of the motion.
     assert found == [([], []), ([0], [1]), ([], [])]
     assert company._shared[1].tolist() == [8, 0] and company._own[1].tolist() == [8, 2.6]
     assert company._shared[0].tolist() == [0, 0]
@@ -554,7 +554,7 @@ def test_ways_are_compared_over_images_and_begin_anew():
     assert [company.compare(motion, None, doubtful, 1)[0] for _ in range(3)] == [[], [], []]
 
 
-# ---- measurements that are those of markers
+# ---- measurements accepted as those of markers
 
 
 @pytest.mark.parametrize(
@@ -570,7 +570,7 @@ def test_ways_are_compared_over_images_and_begin_anew():
         ({'depth': 0.79}, False),
         ({'depth': 2.87}, True),
         ({'depth': 2.89}, False),
-        ({'off': 3.2}, True),  # 5.5 deviations of 0.1 x 2 + 0.15 + 0.05^2 px^2
+        ({'off': 3.2}, True),  # 5.5 deviations for 0.1 x 2 + 0.15 + 0.05^2 px^2
         ({'off': 3.3}, False),
     ],
 )
@@ -594,7 +594,7 @@ def test_fitted_shadows_are_those_of_markers_within_their_limits(changes, good):
 
 
 def test_a_marker_without_a_shadow_shares_that_of_the_nearest_one():
-    """Their predictions are moved so that their middle is the shadow."""
+    """Both predictions are shifted such that their midpoint is the shadow."""
     motion = moving([[100.0, 100], [104, 100], [130, 100], [300, 300]], np.zeros(2))
     measurement = MarkerMeasurement(Fake(radius_px=3.0, blur_px=1.0), None, gate=4.5, shutter=0.5)
     start = motion.uv.copy()
@@ -639,10 +639,10 @@ def test_of_three_rays_a_false_one_is_left_out():
     xyz = RNG.uniform(-40, 40, (6, 3))
     uv = np.stack([f.ideal(xyz) for f in rig.fluoroscopes])
     uv += RNG.normal(0, 0.1, uv.shape)
-    uv[1, 2] += [40.0, 40.0]  # false among three
-    uv[0, 4] = np.nan  # only two rays
+    uv[1, 2] += [40.0, 40.0]  # false, one of three rays
+    uv[0, 4] = np.nan  # two rays only
     uv[2, 5] = np.nan
-    uv[1, 5] += [40.0, 40.0]  # false, one of two
+    uv[1, 5] += [40.0, 40.0]  # false, one of two rays
     sigma = np.full((3, 6), 0.1)
     sigma[np.isnan(uv[..., 0])] = np.nan
     points, lack = RayFit(orientation).intersect(uv, sigma)

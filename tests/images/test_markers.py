@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Markers in motion: followed through crossings and occlusions, and doubtful ids are said."""
+"""Markers in motion are followed through crossings and occlusions; doubtful ids are reported."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ from fluoro_calib_ros.simulation.marker_images import (
 from fluoro_calib_ros.simulation.rig import VirtualRig
 
 FRAMES = 30
-SEED = 26  # markers cross in both views, and are apart in the first images
+SEED = 26  # markers cross in both views, but are apart in the first images
 OPTIONS = MarkerOptions(shutter=SCENE.shutter)
-FAR_PX = 1.0  # from the truth, beyond which a centre is that of something else
+FAR_PX = 1.0  # a centre further from the truth is that of another object
 
 
 @cache
@@ -63,7 +63,7 @@ def rig() -> VirtualRig:
 
 @cache
 def sequence() -> tuple[np.ndarray, tuple[dict[str, MarkerImage], ...]]:
-    """Ids of the markers, and the images of all exposures by fluoroscope."""
+    """Return the ids of the markers, and the images of all exposures by fluoroscope."""
     markers = MovingMarkers(SCENE, SEED)
     settings = replace(MARKER_SETTINGS, round_field=False)
     return markers.target_id, tuple(
@@ -73,7 +73,7 @@ def sequence() -> tuple[np.ndarray, tuple[dict[str, MarkerImage], ...]]:
 
 @cache
 def calibration() -> tuple[dict[str, FluoroscopeCalibration], RigOrientation]:
-    """The true calibration of the rig."""
+    """Return the true calibration of the rig."""
     calibrations = {
         f.name: FluoroscopeCalibration(
             fluoroscope=f.name,
@@ -117,7 +117,7 @@ def calibration() -> tuple[dict[str, FluoroscopeCalibration], RigOrientation]:
 
 
 def given(name: str) -> FirstMarkers:
-    """Markers of the first image, to half a pixel."""
+    """Return the markers of the first image, accurate to half a pixel."""
     ids, images = sequence()
     image = images[0][name]
     rng = np.random.default_rng(2)
@@ -152,7 +152,7 @@ def followed_in_both(options: MarkerOptions = OPTIONS) -> tuple[ViewsFrame, ...]
 
 
 def errors(name: str, frames: tuple[MarkerFrame, ...]) -> tuple[np.ndarray, ...]:
-    """Errors (n, 2) [px], standard deviations and doubts (n,) of all measured markers."""
+    """Return errors (n, 2) [px], standard deviations and doubts (n,) of all measured markers."""
     ids, images = sequence()
     away = [
         found.uv - of[name].uv[np.searchsorted(ids, found.target_id)]
@@ -198,7 +198,7 @@ def test_two_views_leave_no_wrong_id_and_hardly_a_doubt():
 
 
 def meeting(frame: int, turn: bool) -> tuple[np.ndarray, np.ndarray]:
-    """An image of two markers that meet and pass, or turn back; and their places."""
+    """Return an image of two markers that meet and then pass or turn back, and all places."""
     t = frame - 11.0
     along = -abs(t) if turn else t
     first = np.array([64.0 + 2.5 * along, 64.0])
@@ -239,7 +239,7 @@ def test_markers_that_pass_keep_their_ids():
 
 
 def test_markers_that_are_not_seen_are_led_by_those_that_are(monkeypatch):
-    """By velocities before and after the image, and not learned from doubtful ones."""
+    """Velocities before and after the image are used; nothing is learned from doubtful markers."""
     told = []
 
     def lead(motion, seen, before, sure):
@@ -250,7 +250,7 @@ def test_markers_that_are_not_seen_are_led_by_those_that_are(monkeypatch):
     tracker = MarkerTracker(first=FirstMarkers(np.arange(1, 6), meeting(1, False)[1]))
     for number in range(1, 9):
         image, true = meeting(number, False)
-        if number == 7:  # the last one is covered
+        if number == 7:  # cover the last marker
             u, v = true[4].astype(int)
             image[v - 12 : v + 12, u - 12 : u + 12] = image[:10].mean()
         found = tracker.update(image, number)
@@ -307,7 +307,7 @@ def test_a_person_sets_right_what_was_exchanged():
         last = tracker.update(image, number)
         assert last.target_id.tolist() == [1, 2, 3, 4, 5] and not last.doubtful.any()
         assert np.abs(last.uv - true).max() < 0.3
-    # The other way round, too: what a person says of two markers counts.
+    # A wrong exchange is followed as well: what a person states about two markers counts.
     tracker.place(FirstMarkers([1, 2], np.round(meeting(25, True)[1][[1, 0]])))
     image, true = meeting(25, True)
     last = tracker.update(image, 25)
@@ -330,7 +330,7 @@ def test_markers_are_found_again_after_images_without_any():
 
 
 def test_two_views_live_are_followed_as_in_a_recording():
-    """Beginning with the first exposure that shows both views; one may be missing later."""
+    """Following begins with the first exposure that shows both views; one may be missing later."""
     _, images = sequence()
     calibrations, orientation = calibration()
     first = {name: given(name) for name in 'ab'}
@@ -340,7 +340,7 @@ def test_two_views_live_are_followed_as_in_a_recording():
     alone = live.extract({'a': images[0]['a'].image}, 1)
     assert alone['a'].reason == 'the view of b is missing'
     empty = {name: np.full((SIZE, SIZE), 20000, np.uint16) for name in 'ab'}
-    assert live.extract(empty, 1)['a'].reason  # and waits for the markers
+    assert live.extract(empty, 1)['a'].reason  # it waits for the markers
     for number, of in enumerate(images[:4], 2):
         seen = {name: image.image for name, image in of.items()}
         if number == 4:
@@ -415,7 +415,7 @@ def test_decisions_change_earlier_images():
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Ten images of both fluoroscopes, markers of the second, and the calibration."""
+    """Write ten images of both fluoroscopes, markers of the second, and the calibration."""
     ids, images = sequence()
     for name in 'ab':
         (tmp_path / 'images' / name).mkdir(parents=True)
@@ -438,7 +438,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize('names', ['a', 'a,b'])
 def test_markers_enter_a_recording_where_they_are_given_first(folder, names):
-    """In the exposures after it, in both views, although no body says where they are."""
+    """They are followed in later exposures and in both views, although no body predicts them."""
     ids, images = sequence()
     late = int(ids[2])
     with open(folder / 'first.csv', newline='') as file:
@@ -559,19 +559,19 @@ def test_pictures_show_ids_and_doubts():
 
 # ---- a correction that depends on the angle of the C-arm
 
-TURNED = 20  # exposures
-DOUBTING = replace(OPTIONS, margin=200.0)  # with so many doubts that there is something to decide
-JOINT = {'a': 1.0, 'b': -1.0}  # the arms turn against each other
+TURNED = 20  # number of exposures
+DOUBTING = replace(OPTIONS, margin=200.0)  # so wide that there are doubts to decide
+JOINT = {'a': 1.0, 'b': -1.0}  # the arms turn in opposite directions
 
 
 def angle_at(name: str, number: int) -> float:
-    """Angle of the C-arm of a fluoroscope in an exposure [rad]."""
+    """Return the angle of the C-arm of a fluoroscope in an exposure [rad]."""
     return JOINT[name] * (0.4 + 0.02 * number)
 
 
 @cache
 def turning() -> dict[str, FluoroscopeCalibration]:
-    """The calibrations, with a correction that an angle changes by some px."""
+    """Return the calibrations, with a correction that changes by some px with the angle."""
     calibrations, _ = calibration()
     return {name: rigs.turning(each, size_px=6.0) for name, each in calibrations.items()}
 
@@ -585,7 +585,7 @@ def turning_orientation() -> RigOrientation:
 
 @cache
 def turned_images() -> tuple[dict[str, np.ndarray], ...]:
-    """Images of the first exposures, distorted as at the angles of their C-arms."""
+    """Return the images of the first exposures, distorted as at the angles of their C-arms."""
     out = []
     for number, of in enumerate(sequence()[1][:TURNED], 1):
         distorted = {}
@@ -602,7 +602,7 @@ def turned_images() -> tuple[dict[str, np.ndarray], ...]:
 
 
 def displaced(name: str, number: int, uv: np.ndarray) -> np.ndarray:
-    """Where true image points (k, 2) of an exposure are seen at its angle."""
+    """Return the pixels at which true image points (k, 2) of an exposure appear at its angle."""
     seen = uv
     for _ in range(20):
         seen = uv + turning()[name].angle_field.change(seen, angle_at(name, number))[0]
@@ -640,7 +640,7 @@ def decided(frames: Iterable[ViewsFrame]) -> list[tuple[str, str, tuple[int, ...
 
 @pytest.mark.long
 def test_doubts_are_decided_at_the_angles_of_the_arms_as_without_distortion():
-    """The mean over the angles, whose standard deviation is larger, decides nothing else."""
+    """With the mean over the angles, whose deviation is larger, there are no other decisions."""
     assert np.abs(displaced('b', 1, given('b').uv) - given('b').uv).max() > 5
     straight = decided(followed_in_both(DOUBTING)[:TURNED])
     at_angle = decided(followed_while_turning(True))
@@ -688,7 +688,7 @@ def test_markers_are_identified_by_their_shapes_at_the_angles_of_the_arms():
 
 @pytest.mark.parametrize('seed', range(6))
 def test_a_body_is_found_among_other_shadows_in_any_pose_and_not_where_it_is_absent(seed):
-    """Shadows of 40 other points in each view; the ids are right, or there are none."""
+    """With shadows of 40 other points in each view, the ids are right or there are none."""
     rng = np.random.default_rng(seed)
     calibrations, orientation = calibration()
     body = Body('bone', np.arange(11, 16), rng.uniform(-9, 9, (5, 3)), np.full(5, 0.03))
@@ -707,7 +707,7 @@ def test_a_body_is_found_among_other_shadows_in_any_pose_and_not_where_it_is_abs
 
 
 def drawn(places: Sequence[tuple[np.ndarray, float]], size: int) -> np.ndarray:
-    """Image of blurred dark discs: places (k, 2) and their radius [px]."""
+    """Return an image of blurred dark discs of places (k, 2) and a radius [px]."""
     fine = 4
     light = np.full((size * fine, size * fine), 180, np.uint8)
     for uv, radius in places:
@@ -719,7 +719,7 @@ def drawn(places: Sequence[tuple[np.ndarray, float]], size: int) -> np.ndarray:
 
 
 def test_bodies_with_markers_of_different_sizes_are_found_together():
-    """No size of shadows shows all: where one body is missing, other sizes are looked for."""
+    """No single size shows all shadows: while a body is missing, other sizes are tried."""
     rng = np.random.default_rng(2477)  # no two markers are within 9 px in a view
     shapes = [rng.uniform(-12, 12, (6, 3)) for _ in range(2)]
     bodies = [
@@ -739,7 +739,7 @@ def test_bodies_with_markers_of_different_sizes_are_found_together():
 
 
 def test_bodies_that_an_impact_moves_are_found_again_and_no_wrong_id_is_left():
-    """Two bodies move by 20 px between two images; then a view misses an image."""
+    """Both bodies move by 20 px between two images; afterwards a view misses an image."""
     rng = np.random.default_rng(2477)
     shapes = [rng.uniform(-12, 12, (6, 3)) for _ in range(2)]
     bodies = [
@@ -748,7 +748,7 @@ def test_bodies_that_an_impact_moves_are_found_again_and_no_wrong_id_is_left():
     ]
     ids = np.concatenate([body.target_id for body in bodies])
     calibrations, orientation = calibration()
-    ways = np.array([[5.0, 3.0, 6.0], [-6.0, 2.0, -5.0]])  # mm, in the first exposure
+    ways = np.array([[5.0, 3.0, 6.0], [-6.0, 2.0, -5.0]])  # [mm], in the first exposure
 
     def true(number: int) -> dict[str, np.ndarray]:
         moved = 2 * (1 - 0.5 ** max(number - 4, 0))
@@ -777,13 +777,13 @@ def test_bodies_that_an_impact_moves_are_found_again_and_no_wrong_id_is_left():
 
 
 def without_second_body(images: dict[str, MarkerImage]) -> dict[str, np.ndarray]:
-    """Images of an exposure without the markers of the second body."""
+    """Return the images of an exposure without the markers of the second body."""
     return {name: covered(of, np.s_[4:]) for name, of in images.items()}
 
 
 @pytest.mark.parametrize('covered_until', [0, 6])
 def test_bodies_are_found_by_their_shapes_and_join_when_they_appear(covered_until):
-    """Without given markers; a body that is not in the first exposures is followed later."""
+    """No markers are given; a body that is not in the first exposures is followed later."""
     ids, images = sequence()
     calibrations, orientation = calibration()
     settings = MarkerSettings(
@@ -809,7 +809,7 @@ def test_bodies_are_found_by_their_shapes_and_join_when_they_appear(covered_unti
 
 
 def test_a_body_is_found_again_where_it_comes_back():
-    """Both views lose it for a third of the recording, in which it moves far."""
+    """Both views lose it for a third of the recording, during which it moves far."""
     ids, images = sequence()
     calibrations, orientation = calibration()
     first = {name: given(name) for name in 'ab'}
@@ -846,7 +846,7 @@ def test_markers_of_no_body_are_followed():
 
 
 def save_turning(folder: Path) -> None:
-    """Write the result folder of the fluoroscopes whose corrections depend on the angle."""
+    """Write a result folder of fluoroscopes whose corrections depend on the angle."""
     folder.mkdir()
     for each in turning().values():
         save_calibration(folder, each)
@@ -864,7 +864,7 @@ def write_turned_first(path: Path) -> None:
 
 @pytest.mark.long
 def test_command_follows_markers_at_the_angles_of_a_bag(tmp_path, capsys, monkeypatch):
-    """The angles also stand in the table that it writes; without them a note says so."""
+    """The table that it writes also has the angles; without them, a note says so."""
     time = message_class('builtin_interfaces/msg/Time')
     header = message_class('std_msgs/msg/Header')
     with BagWriter(tmp_path / 'bag') as bag:

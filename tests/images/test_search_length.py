@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How long a pose is searched for in an image of another phantom."""
+"""Length of the search for a pose in an image of another phantom."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_another_phantom_is_refused_after_as_many_beads_as_would_tell(monkeypatc
     seen = seen_of(beads(2, 170))
     with refused(Kind.NO_POSE):
         matching.match(seen, model, LENS)
-    assert len(tried) < 70  # of 122
+    assert len(tried) < 70  # out of 122
     tried.clear()
     found = matching.match(seen_of(model.xyz), model, LENS)
     assert np.array_equal(found.bead, found.detection) and len(tried) <= matching.CENTRAL

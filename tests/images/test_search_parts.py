@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of the search of phantoms and markers against written-out formulas."""
+"""Parts of the search for phantoms and markers against written-out formulas."""
 
 from types import SimpleNamespace as Fake
 
@@ -54,7 +54,7 @@ LENS = Lens((1024, 1024), 4000.0)
 
 def test_triples_are_a_bead_and_two_of_its_neighbours():
     triples = triples_of(BEADS, 3)
-    _, near = cKDTree(BEADS).query(BEADS, k=13)  # half of the beads vote
+    _, near = cKDTree(BEADS).query(BEADS, k=13)  # 12 neighbours vote: half of the beads
     for row in range(0, len(triples.bead), 7):
         one, two, three = triples.bead[row]
         assert {two, three} <= set(near[one, 1:4].tolist()) and two != three
@@ -66,7 +66,7 @@ def test_triples_are_a_bead_and_two_of_its_neighbours():
         axes = np.stack([a, b, np.cross(a, b)])
         others = BEADS[near[one, 1:]] - BEADS[one]
         np.testing.assert_allclose(triples.voter[..., row] @ axes, others, atol=1e-3)
-    # Of six pairs of three neighbours, those that are not nearly in one line.
+    # Three neighbours form six ordered pairs; those that are nearly collinear are dropped.
     assert 0.8 * 6 * len(BEADS) < len(triples.bead) <= 6 * len(BEADS)
     chosen = np.arange(len(BEADS)) < 2
     assert set(triples.of_beads(chosen).bead[:, 0].tolist()) == {0, 1}
@@ -94,7 +94,7 @@ def test_three_beads_give_the_scale_and_the_rotation():
         turn = Rotation.random(random_state=number).as_matrix()
         p, q = 3.5 * triples.sides[number] @ turn[:2].T
         row, axes, scale = _solutions(p, q, triples, (3.0, 4.0))
-        if not len(row):  # nearly in one line in the image
+        if not len(row):  # nearly collinear in the image
             assert abs(p[0] * q[1] - p[1] * q[0]) <= 0.2 * np.hypot(*p) * np.hypot(*q)
             continue
         assert ((scale > 3) & (scale < 4)).all()
@@ -123,9 +123,9 @@ def test_neighbours_in_several_directions_come_before_nearer_ones():
     away = [(1.0, 9.0), (-1.0, 10.0), (1.5, -11.0), (-1.5, -12.0), (2.0, 9.5)]
     uv = np.array(line + away)
     first, _ = neighbours_of(uv, np.array([0, 8]), 6)
-    # Of 60 degrees each, from the direction of the nearest one.
+    # There is one in each sector of 60 degrees, beginning with that of the nearest neighbour.
     np.testing.assert_array_equal(first, [1, 3, 8, 9, 10, 11])
-    # The others follow where there is nothing in a direction.
+    # If a sector is empty, the nearest of the others follow.
     np.testing.assert_array_equal(neighbours_of(uv[:8], np.array([0]), 6)[0], [1, 3, 2, 4, 5, 6])
     assert set(neighbours_of(uv[:3], np.array([1]), 6)[0].tolist()) == {0, 2}
 
@@ -151,7 +151,7 @@ def test_a_search_is_sure_where_all_neighbours_are_a_bead_s_own(monkeypatch, nei
     five = 50 * np.array([(0, 0, 0), (1, 0, 0), (0, 1.1, 0), (0, 0, 1.2), (1, 1.3, 1)])
     chance = _chances(five, 1.0, 1e-3, neighbours)
     np.testing.assert_array_equal(chance, np.ones(pose_search.VIEWS))
-    # One of 2^10 is less than one of a thousand.
+    # 1 / 2^10 is below the limit of 1 / 1000.
     assert enough_seeds(five, 5, 1e-3, neighbours) == 5
     monkeypatch.setattr(pose_search, 'MIN_EXPLAINED', 1.0)
     assert enough_seeds(five, 50, 1e-3, neighbours) == 10
@@ -175,7 +175,7 @@ def test_a_pose_begins_with_its_bead_where_it_was_found():
         np.testing.assert_allclose(
             view.rotation @ turn.T @ [0, 0, 1], ray / np.linalg.norm(ray), atol=1e-12
         )
-        # Across the ray, the scale is that of the pose; the sensor is a bit slanted to it.
+        # Across the ray the scale is that of the pose; the sensor is slightly inclined to the ray.
         expected = 2.5 * 0.01 * turn[:2].T
         np.testing.assert_allclose(seen[1:] - seen[0], expected, atol=0.011 * 0.025)
 
@@ -198,7 +198,7 @@ def test_places_in_the_field_are_those_of_its_pixels():
 
 
 def test_evidence_of_a_match_counts_what_is_predicted_and_what_is_found():
-    """Five of 64 predictions are not found, two things are found where nothing is predicted."""
+    """Five of 64 predictions are not found, and two detections are not predicted."""
     v, u = np.mgrid[50:800:100, 50:800:100]
     predicted = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
     xyz = np.column_stack([predicted, np.zeros(64)])
@@ -219,7 +219,7 @@ def test_evidence_of_a_match_counts_what_is_predicted_and_what_is_found():
     assert match.bead.tolist() == there.tolist() and match.detection.tolist() == list(range(59))
     assert match.score == pytest.approx(59 - 5)
     assert _judged(None, xyz, seen, predicted + 2000, 0.3) is None
-    # A prediction beside another one, both of which are found as one, is found, but not matched.
+    # Two neighbouring predictions share a detection: both count as found, neither is matched.
     doubled = np.concatenate([predicted, predicted[there[:1]] + [1.5, 0]])
     two = _judged(None, np.concatenate([xyz, xyz[there[:1]] + [1, 0, 0]]), seen, doubled, 0.3)
     assert two.found == pytest.approx(60 / 65)
@@ -229,7 +229,7 @@ def test_evidence_of_a_match_counts_what_is_predicted_and_what_is_found():
 def test_a_bead_is_supported_by_half_of_its_neighbours():
     line = np.arange(40.0)[:, None] * [1, 0, 0]
     good = np.arange(40) < 20
-    # Six neighbours on either side: those before the 20th have at least as many good ones.
+    # With six neighbours on either side, beads before the 20th have at least as many good ones.
     assert supported(line, good)[:19].all() and not supported(line, good)[21:].any()
     assert supported(line[:3], np.array([True, True, False])).tolist() == [True, True, True]
     assert not supported(line[:3], np.array([True, False, False]))[0]
@@ -242,7 +242,7 @@ def test_regions_with_few_of_their_beads_are_left_out():
     assert [one.all() for one in good] == [True, False, True, True, False]
     assert (good == good[:, :1]).all()
     assert _good_cells(uv[:4], np.zeros(4, bool), (200, 100)).all()
-    # Height and width are not exchanged: a region is 20 px wide and 40 px high.
+    # Width and height are not exchanged: a region is 20 px wide and 40 px high.
     beside = np.repeat([[10.0, 10], [30, 10]], 5, axis=0)
     assert _good_cells(beside, np.arange(10) < 5, (200, 100)).tolist() == 5 * [True] + 5 * [False]
     over = np.repeat([[10.0, 10], [10, 30]], 5, axis=0)
@@ -317,7 +317,7 @@ def test_steps_to_six_neighbours_are_candidates_of_symmetries(monkeypatch):
 
 
 def watched(uv, variance, unseen=None):
-    """A watch on markers 10, 11, ..., and their states; all are settled but the last."""
+    """Return a watch on markers 10, 11, ..., their doubts and states; the last is not settled."""
     motion = Motion.start(uv, 1.0)
     motion.covariance[:, 0, 0] = variance
     motion.covariance[:-1, 1, 1] = 0.01
@@ -342,7 +342,7 @@ def found_at(uv, measured, free=(), shadow=None):
 
 
 def test_a_shadow_of_no_marker_leaves_open_which_one_is_meant():
-    """If its distance from the prediction is hardly less likely than that of the marker."""
+    """It is doubted if the free shadow is hardly less likely than the shadow of the marker."""
     at = np.array([[0.0, 0], [100, 0], [200, 0], [300, 0], [400, 0]])
     watch, doubts, states = watched(at, 4 - 0.5**2)
     free = [[5.0, 0], [107, 0], [204, 0], [305, 0], [405, 0], [1000, 0]]
@@ -361,7 +361,7 @@ def test_a_shadow_of_no_marker_leaves_open_which_one_is_meant():
 
 @pytest.mark.parametrize('moved', [0.0, 1.0, 2.0])
 def test_a_fit_makes_no_shadow_likelier_than_one_as_near_to_the_prediction(moved):
-    """Inside a disc of metal, a fit goes from a false shadow to the place that is predicted."""
+    """Inside a metal disc, a fit moves from a false shadow to the predicted place."""
     at = np.array([[0.0, 0], [100, 0]])
     watch, doubts, states = watched(at, 0.1)
     shadow = at + [2.0, 0]
@@ -373,13 +373,13 @@ def test_a_fit_makes_no_shadow_likelier_than_one_as_near_to_the_prediction(moved
 @pytest.mark.parametrize(
     ('apart', 'measured', 'unseen', 'settled', 'taken_back', 'doubtful'),
     [
-        (3.0, [1, 0], 2, True, True, False),  # a measurement that may be that of the other
+        (3.0, [1, 0], 2, True, True, False),  # the measurement may belong to the other marker
         (3.0, [1, 0], 6, True, True, False),
-        (3.0, [1, 0], 7, True, False, True),  # for too many images
+        (3.0, [1, 0], 7, True, False, True),  # unseen for too many images
         (3.0, [1, 0], 7, False, False, True),  # merged
         (3.0, [1, 0], 2, False, True, False),
         (6.0, [1, 0], 7, True, False, True),
-        (6.0, [1, 0], 7, False, False, False),  # the velocity of one is not known
+        (6.0, [1, 0], 7, False, False, False),  # the velocity of one marker is unknown
         (3.0, [1, 1], 0, True, False, True),
         (3.0, [1, 1], 0, False, False, False),
         (60.0, [1, 0], 7, True, False, False),
@@ -403,7 +403,7 @@ def test_markers_that_met(apart, measured, unseen, settled, taken_back, doubtful
 def test_places_of_the_first_image_tell_no_markers_apart_that_are_nearer_to_each_other(
     apart, doubtful
 ):
-    """They are given to a pixel or two, whoever gives them."""
+    """Whoever gives the places, they are accurate to a pixel or two."""
     at = np.array([[500.0, 300], [500 + apart, 300], [900, 900]])
     watch, doubts, states = watched(at, GIVEN_SD_PX**2, [0, 0, 0])
     states.motion.covariance[:, 1, 1] = 1e6  # no velocity is known
@@ -416,7 +416,7 @@ def test_places_of_the_first_image_tell_no_markers_apart_that_are_nearer_to_each
 
 def test_a_marker_found_again_in_a_wide_gate_is_doubtful():
     at = 100.0 * np.arange(5)[:, None] * [1, 0]
-    few = 0.02 / (np.pi * 4.0**2 * 1e-4)  # variance with which so many false ones are expected
+    few = 0.02 / (np.pi * 4.0**2 * 1e-4)  # variance at which 0.02 false shadows are expected
     variance = few * np.array([1.1, 0.9, 1.1, 1.1, 1.1])
     watch, doubts, states = watched(at, variance, [2, 5, 1, 4, 9])
     told = watch.found_again(found_at(at, [1, 1, 1, 0, 1]), states, 3)
@@ -500,7 +500,7 @@ def test_a_marker_moves_by_the_larger_one_of_its_coordinates():
 
 
 def test_response_to_a_shadow_is_the_smaller_eigenvalue_of_the_hessian():
-    """Also where the rows that are filtered at once meet."""
+    """The tested rows include those where two separately filtered parts meet."""
     width = 4096
     image = np.random.default_rng(6).uniform(0, 100, (24, width)).astype(np.float32)
     assert PIXELS_AT_ONCE // width == 16
@@ -519,7 +519,7 @@ def test_response_to_a_shadow_is_the_smaller_eigenvalue_of_the_hessian():
 
 @pytest.mark.parametrize('normal', [1.0, -1.0])
 def test_a_flat_grid_is_seen_from_where_it_is(normal):
-    """Whichever way its normal points."""
+    """The direction of its normal does not matter."""
     v, u = np.mgrid[-60:61:15, -75:76:15]
     tilt = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
     xyz = np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)]) @ tilt.T + [20.0, 30, -10]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Backgrounds of windows beyond a polynomial: eliminated as a covariance would, and estimated."""
+"""Backgrounds of windows beyond a polynomial: eliminated as by a covariance, and estimated."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PIXELS = len(OFFSET)
 
 
 def windows(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Light behind beads (g, m), derivatives (g, 7, m) and weights (g, m)."""
+    """Return light behind beads (g, m), derivatives (g, 7, m) and weights (g, m)."""
     rng = np.random.default_rng(seed)
     x, y = OFFSET.T / 8
     relative = np.broadcast_to(1 - 0.5 * np.exp(-4 * (x * x + y * y)), (count, PIXELS))
@@ -75,7 +75,7 @@ def test_backgrounds_of_some_windows_are_found_whatever_the_noise(scale):
     residual[:60] += relative[:60] * (amplitude @ COSINES.waves)
     spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
     found = spectra.strengths(1.0)
-    # In units of noise that is as strong as the weights say.
+    # In units of the noise variance that the weights imply.
     assert np.log2(np.median(found[:60]) / 30.0) == pytest.approx(0, abs=1)
     assert np.count_nonzero(found[:60]) >= 54
     assert np.count_nonzero(found[60:]) <= 3

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Markers in three views: what two of them say of the third."""
+"""Markers in three views: what two views predict for the third."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from fluoro_calib_ros.simulation.marker_images import (
 )
 
 OPTIONS = MarkerOptions(shutter=SCENE.shutter, search_every=3)
-FAR_PX = 1.0  # from the truth, beyond which a centre is that of something else
+FAR_PX = 1.0  # a centre further from the truth is that of another object
 
 
 def given(name: str) -> FirstMarkers:
@@ -51,7 +51,7 @@ def given(name: str) -> FirstMarkers:
 
 
 def away(found: MarkerFrame, name: str, number: int) -> np.ndarray:
-    """Distances (n,) of markers of an exposure from the truth [px]."""
+    """Return distances (n,) [px] of the markers of an exposure from the truth."""
     true = sequence()[number - 1][name].uv[np.searchsorted(ids(), found.target_id)]
     return np.linalg.norm(found.uv - true, axis=1)
 
@@ -64,7 +64,7 @@ def plain(of: dict[str, MarkerImage]) -> dict[str, np.ndarray]:
 
 
 def rays_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image points (3, n, 2) of points (n, 3), and their standard deviations."""
+    """Return image points (3, n, 2) of points (n, 3), and their standard deviations."""
     uv = np.stack([f.ideal(points) for f in rig().fluoroscopes])
     return uv, np.full(uv.shape[:2], 0.1)
 
@@ -81,7 +81,7 @@ def test_the_false_ray_of_three_is_told_by_the_others():
     assert (lack[:, told][is_false[:, told]] > AGREE).all()
     assert (lack[:, told][~is_false[:, told]] < 0.1).all()
     assert np.abs(found.xyz_mm[told] - points[told]).max() < 1e-3
-    # Where the others do not tell it, all are in doubt.
+    # If the other rays do not identify the false one, all rays are doubtful.
     assert (lack[:, ~told] > AGREE).all()
 
 
@@ -106,7 +106,7 @@ def test_agreement_has_the_same_probability_for_two_rays_and_for_three():
     _, of_three = RayFit(exact).intersect(uv, sigma)
     _, of_two = RayFit(exact.subset(['a', 'b'])).intersect(uv[:2], sigma[:2])
     beyond = [(lack[0] > 2.5 * AGREE / 4).mean() for lack in (of_two, of_three)]
-    assert beyond[0] == pytest.approx(0.0124, abs=0.002)  # of a normal deviate
+    assert beyond[0] == pytest.approx(0.0124, abs=0.002)  # tail of a normal deviate
     assert (of_three[0] > AGREE).mean() < 4e-4 and (of_two[0] > AGREE).mean() < 4e-4
 
 
@@ -120,7 +120,7 @@ def seen_rig() -> CalibratedRig:
 
 @pytest.mark.parametrize('seed', range(4))
 def test_a_body_is_found_by_markers_each_of_which_two_views_see(seed):
-    """In any pose, among shadows of 30 other points; no two views see four markers."""
+    """In any pose, among shadows of 30 other points; no two views have four markers in common."""
     rng = np.random.default_rng(seed)
     body = Body('bone', np.arange(11, 17), rng.uniform(-9, 9, (6, 3)), np.full(6, 0.03))
     turned = body.xyz_mm @ matrix_from_vector(rng.normal(0, 2, 3)).T + rng.uniform(-5, 5, 3)
@@ -139,7 +139,7 @@ def test_a_body_is_found_by_markers_each_of_which_two_views_see(seed):
 
 
 def test_points_of_three_rays_leave_few_of_two():
-    """Shadows that three views explain are not intersected with others as well."""
+    """Shadows that three views explain are not intersected in pairs as well."""
     xyz = np.random.default_rng(7).uniform(-25, 25, (40, 3))
     views = [f.ideal(xyz) for f in rig().fluoroscopes]
     points = shadow_points(views, seen_rig())
@@ -161,7 +161,7 @@ def test_views_without_bodies_are_left_out_and_named_where_two_are_needed():
 
 
 def test_a_view_that_sees_nothing_at_first_does_not_keep_the_others_from_starting():
-    """It joins them when the markers enter it, from where their bodies are."""
+    """It joins when the markers enter it, starting from the places of their bodies."""
     calibrations, orientation = calibration()
     follower = MarkerSettings({}, OPTIONS, calibrations, orientation, bodies())()
     joined = []
@@ -183,7 +183,7 @@ def test_a_view_that_sees_nothing_at_first_does_not_keep_the_others_from_startin
 
 
 def test_bodies_are_found_and_followed_in_three_views():
-    """Without given markers; a marker that c does not see at first is joined when it does."""
+    """No markers are given; one that c does not see at first is added when it does."""
     calibrations, orientation = calibration()
     follower = MarkerSettings({}, OPTIONS, calibrations, orientation, bodies())()
     seen = right = 0
@@ -201,7 +201,7 @@ def test_bodies_are_found_and_followed_in_three_views():
             seen += int(of[name].seen.sum()) - (name == 'c' and number <= 10)
             if name == 'c':
                 joined.append(ids()[1] in found.target_id[~far])
-            else:  # the other two go on with it
+            else:  # the other two follow it meanwhile
                 assert number > 10 or ids()[1] in found.target_id[~far]
     assert right > 0.95 * seen
     assert not any(joined[:10]) and sum(joined[10:]) > 0.8 * len(joined[10:])
@@ -211,7 +211,7 @@ def test_bodies_are_found_and_followed_in_three_views():
 
 
 def test_ids_that_one_view_exchanged_are_told_by_the_others():
-    """Markers of no body: of two views, nobody knows which of them is wrong."""
+    """Without a body, two views alone could not show which of them is wrong."""
     calibrations, orientation = calibration()
     first = {name: given(name) for name in THREE}
     wrong = first['c'].target_id.copy()
@@ -224,7 +224,7 @@ def test_ids_that_one_view_exchanged_are_told_by_the_others():
         decisions += found.decisions
         for name, view in found.views.items():
             far = away(view, name, number) > FAR_PX
-            # Wrong ids that were given are noticed in the exposure after the first at the latest.
+            # Wrong ids given for the first exposure are noticed in the next one at the latest.
             assert number == 1 or not (far & ~view.doubtful).any()
             assert name == 'c' or not far.any()
     exchanged = [d for d in decisions if d.kind == 'exchanged']
@@ -251,7 +251,7 @@ def test_an_exposure_without_one_of_the_views_is_followed_in_the_others():
 
 
 def test_a_marker_of_no_body_is_found_where_two_views_see_it():
-    """While a third one lost it for long; two views alone could not tell where it is."""
+    """The third view has lost it for long; two views alone could not determine where it is."""
     calibrations, orientation = calibration()
     first = {name: given(name) for name in THREE}
     views = MarkerViews(calibrations, orientation, OPTIONS, first=first)
@@ -286,7 +286,7 @@ def test_what_cannot_be_followed_together_is_said():
 
 
 def test_the_command_follows_three_fluoroscopes(tmp_path, capsys):
-    """A folder for each, ids from bodies.csv."""
+    """Images come from a folder for each fluoroscope, ids from bodies.csv."""
     save_three(tmp_path / 'result')
     write_bodies(tmp_path / 'bodies.csv', bodies())
     for number, of in enumerate(sequence()[:6], 1):

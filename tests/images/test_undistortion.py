@@ -26,13 +26,13 @@ DEPTHS = (np.uint8, np.uint16)
 
 @functools.cache
 def calibration(kind='auto'):
-    """A calibration of the virtual rig."""
+    """Return a calibration of the virtual rig."""
     return rigs.calibrated('a', model=kind).calibrations['a']
 
 
 def corrector(interpolation='linear', kind='auto', border=0):
-    """An ImageCorrector of it."""
-    return _corrector(interpolation, kind, border)  # a cache tells a default from the same value
+    """Return an ImageCorrector of this calibration."""
+    return _corrector(interpolation, kind, border)  # f() and f('linear') differ for a cache
 
 
 @functools.cache
@@ -41,25 +41,25 @@ def _corrector(interpolation, kind, border):
 
 
 def with_model(model, size):
-    """A calibration for images of another size, with another model."""
+    """Return the calibration for images of another size, with another model."""
     return replace(calibration(), model=model, image_size=size)
 
 
 def model_of(uv, duv, kind='local_linear', k=6):
-    """A CorrectionModel of training points and corrections (n, 2) [px]."""
+    """Return a CorrectionModel of training points and corrections (n, 2) [px]."""
     return create_model(
         kind, k, np.asarray(uv, dtype=float), np.asarray(duv, dtype=float), 0.2, 0.0
     )
 
 
 def lattice(size, step=8.0):
-    """Pixels (n, 2) all over an image."""
+    """Return pixels (n, 2) all over an image."""
     axes = [np.linspace(-0.5, s - 0.5, round(s / step) + 1) for s in size]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
 
 
 def random_image(dtype, size=SIZE):
-    """Smooth noise: grey values over the whole range, without what interpolation cannot follow."""
+    """Return smooth noise over the range of grey values, which interpolation can reproduce."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[: size[1], : size[0]]
     waves = sum(np.sin(x * a + y * b + c) for a, b, c in rng.uniform(-0.15, 0.15, (6, 3)))
@@ -67,9 +67,9 @@ def random_image(dtype, size=SIZE):
 
 
 def off(image, light, uv, reach=9):
-    """Distances (n, 2) [px] of the blobs in an image (h, w), beside light (h, w) without them,
-    from pixels uv (n, 2) near them: least squares of a Gaussian with its first and second moments,
-    on a plane.
+    """Return distances (n, 2) [px] of the blobs in an image (h, w) from nearby pixels uv (n, 2).
+    The blobs are missing in light (h, w). A Gaussian with its first and second moments is fitted
+    on a plane by least squares.
     """
     taken = 1 - image / light
     out = []
@@ -88,7 +88,7 @@ def off(image, light, uv, reach=9):
     return np.array(out)
 
 
-# ---- where things go
+# ---- positions
 
 
 @pytest.mark.long
@@ -101,7 +101,7 @@ def test_corrected_source_of_a_pixel_is_the_pixel(kind):
     assert np.abs(corrected.uv - np.stack([u, v], axis=1)).max() < LIMIT_PX
     assert (
         np.mean(corrected.status == this.status[this.mask]) > 0.9999
-    )  # 32 bits may cross the rim of a cell
+    )  # the rounding to 32 bits may cross the edge of a cell
     assert (
         np.isnan(this.source[:, ~this.mask]).all()
         and not np.isnan(this.source[:, this.mask]).any()
@@ -113,8 +113,8 @@ def test_corrected_source_of_a_pixel_is_the_pixel(kind):
 @pytest.mark.parametrize('dtype', DEPTHS)
 @pytest.mark.long
 def test_beads_move_as_points_do(dtype, interpolation):
-    """Blobs drawn at observed positions lie where calibration.correct puts them; the distortion is
-    up to 17 px.
+    """Blobs drawn at observed positions appear where calibration.correct puts them; the distortion
+    is up to 17 px.
     """
     at = np.stack(np.meshgrid(np.arange(62, 980, 60), np.arange(62, 980, 60)), axis=-1).reshape(
         -1, 2
@@ -126,14 +126,14 @@ def test_beads_move_as_points_do(dtype, interpolation):
     light = corrector().correct(bead_image([], SIZE, np.uint16, noise=0.0)) / (
         65_535 / np.iinfo(dtype).max
     )
-    with np.errstate(divide='ignore', invalid='ignore'):  # at the rim, where there is nothing
+    with np.errstate(divide='ignore', invalid='ignore'):  # the rim has no light
         error = off(corrector(interpolation).correct(image), light, wanted)
     assert np.sqrt(np.mean(error**2)) < 0.01 and np.abs(error).max() < 0.03
 
 
 @pytest.mark.parametrize('interpolation, limit', [('linear', 1 / 64), ('cubic', 1 / 45)])
 def test_map_is_as_accurate_as_documented(interpolation, limit):
-    """On an image of coordinates: within OpenCV's 1/32 px and rounding."""
+    """In an image of coordinates, the error is OpenCV's 1/32 px plus rounding."""
     this = corrector(interpolation)
     inner = this.mask & np.all((this.source > 1) & (this.source < 1022), axis=0)
     for axis, ramp in enumerate(np.mgrid[:1024, :1024][::-1] * 60):
@@ -161,8 +161,8 @@ def test_against_scipy(dtype, interpolation, order):
 
 @pytest.mark.parametrize('interpolation, limit', [('linear', 0.02), ('cubic', 0.005)])
 def test_distorted_and_corrected_image_is_the_original(interpolation, limit):
-    """An image distorted by the correction and corrected again is the original, except for
-    interpolation errors.
+    """The image is distorted by the correction and corrected again; the difference is due to
+    interpolation.
     """
     this = corrector(interpolation)
     image = random_image(np.uint16)
@@ -186,8 +186,8 @@ def test_distorted_and_corrected_image_is_the_original(interpolation, limit):
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_constant_image_stays_constant(dtype, interpolation):
-    """Up to the edge of the observed area, without mixing with the border; beyond it is the
-    border.
+    """It does up to the edge of the observed area, without mixing with the border; pixels beyond
+    have the border value.
     """
     this = corrector(interpolation, border=7)
     value = np.iinfo(dtype).max
@@ -204,7 +204,7 @@ def test_constant_image_stays_constant(dtype, interpolation):
 @pytest.mark.parametrize('dtype', DEPTHS)
 @pytest.mark.parametrize('size', [(37, 20), (1, 1), (16, 33)])
 def test_identity_without_distortion(size, dtype, interpolation):
-    """To the bit, up to the last pixel, for images of any size."""
+    """Every bit up to the last pixel is the same, for images of any size."""
     uv = lattice((40, 40))
     calibration_of_none = with_model(model_of(uv, 0 * uv, 'none', 0), size)
     image = np.random.default_rng(0).integers(
@@ -241,7 +241,7 @@ def test_fold_is_left_empty():
     uv = lattice((96, 96), 4)
     duv = np.zeros_like(uv)
     middle = np.abs(uv[:, 0] - 48) < 10
-    duv[:, 0] = np.clip((uv[:, 0] - 48) * 1.8, -18, 18)  # 1.8 px for each in a stripe of 20
+    duv[:, 0] = np.clip((uv[:, 0] - 48) * 1.8, -18, 18)  # 1.8 px per px, 20 px wide
     this = ImageCorrector(with_model(model_of(uv, duv), size))
     assert middle.any() and this.mask.any() and not this.mask.all()
     step = np.diff(this.source[0], axis=1)
@@ -257,11 +257,11 @@ def test_steps_of_nearest_neighbours_leave_few_holes():
     assert np.mean(this.mask[100:-100, 100:-100]) > 0.99
 
 
-# ---- images, and what is none
+# ---- images, valid and invalid
 
 
 def test_sixteen_bits_are_preserved():
-    """Values that differ by less than eight bits resolve."""
+    """Differences smaller than a grey level of eight bits are preserved."""
     image = np.full(SIZE[::-1], 40_000, np.uint16)
     image[:, ::2] += 1
     got = corrector().correct(image)
@@ -269,7 +269,7 @@ def test_sixteen_bits_are_preserved():
 
 
 def test_cubic_does_not_wrap_around():
-    """Cubic interpolation overshoots next to an edge from black to white: values are clipped."""
+    """Cubic interpolation overshoots at an edge from black to white: values are clipped."""
     image = np.zeros(SIZE[::-1], np.uint8)
     image[:, 500:] = 255
     for dtype in DEPTHS:
@@ -280,7 +280,7 @@ def test_cubic_does_not_wrap_around():
 
 
 def test_output_array_and_rows_with_gaps():
-    """The same numbers with a given output array, with strided rows, and from read-only input."""
+    """A given output array, strided rows and read-only input do not change the numbers."""
     this = corrector()
     image = random_image(np.uint16)
     wanted = this.correct(image)
@@ -296,7 +296,7 @@ def test_output_array_and_rows_with_gaps():
 
 
 def test_invalid_images_are_refused():
-    """In one sentence each."""
+    """Each is refused in one sentence."""
     this = corrector()
     image = np.zeros(SIZE[::-1], np.uint8)
     for wrong, sentence in (
@@ -344,8 +344,8 @@ def test_threads_share_a_corrector():
 
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_virtual_image(dtype):
-    """Beads lie at the given positions, the background is smooth, the noise is as given and
-    reproducible.
+    """Beads lie at the given positions, the background is smooth, and the noise is reproducible
+    and of the given size.
     """
     uv = np.array([[100.3, 80.7], [200.0, 40.25], [-3.0, 50.0], [1000.0, 1000.0], [np.nan, 3.0]])
     size = (256, 200)
@@ -357,7 +357,7 @@ def test_virtual_image(dtype):
     far[30:120, :] = False
     far[:80, 170:230] = False
     assert np.abs(clean[far] - light[far]).max() <= 0.51
-    assert clean[50, 0] < 0.8 * light[50, 0]  # that of a bead beside the image
+    assert clean[50, 0] < 0.8 * light[50, 0]  # from a bead outside the image
     noisy = bead_image(uv, size, dtype, noise=0.02, seed=3)
     assert np.array_equal(noisy, bead_image(uv, size, dtype, noise=0.02, seed=3))
     sd = np.std((noisy.astype(float) - clean)[far]) / np.iinfo(dtype).max

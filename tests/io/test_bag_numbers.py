@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers of bags: gaps, restarts and partners of streams, spans of files, limits of a queue."""
+"""Numerical results for bags: gaps, restarts and partners of streams, spans of files, queues."""
 
 import struct
 from collections import Counter
@@ -76,10 +76,10 @@ def test_longest_gap_is_of_either_clock():
     [
         ([0, 20, 40, 60, 261], True),  # ten intervals are 200 ms
         ([0, 20, 40, 60, 260], False),
-        ([0, 1, 2, 3, 104], True),  # but not below a tenth of a second
+        ([0, 1, 2, 3, 104], True),  # but at least a tenth of a second
         ([0, 1, 2, 3, 103], False),
         ([0, 99, 198, 297, 2000], True),
-        ([0, 100, 200, 300, 9000], False),  # no stream
+        ([0, 100, 200, 300, 9000], False),  # not a stream
         ([0, 0, 0, 0, 9000], False),
         ([5], False),
     ],
@@ -109,7 +109,7 @@ def test_frame_numbers_that_are_missing_repeated_or_begin_again():
 
 
 def cdr(order, sec, nanosec, frame_id, number):
-    """Bytes of a message that begins with a header and a number."""
+    """Return the bytes of a message that begins with a header and a number."""
     text = frame_id.encode() + b'\0'
     head = struct.pack(f'{order}iII', sec, nanosec, len(text)) + text
     head += bytes(-len(head) % 4)
@@ -173,7 +173,7 @@ def test_compression_is_named_where_a_chunk_has_it():
 
 
 def test_next_chunk_is_found_by_its_head_or_its_compression(monkeypatch):
-    """Where the length of the record is damaged, the name of the compression tells it."""
+    """If the length of the record is damaged, the name of the compression reveals it."""
     length = salvage._TO_COMPRESSION
     compression = struct.pack('<I', 4) + b'zstd'
     head = RECORD.pack(Opcode.CHUNK, 500) + bytes(range(1, length - RECORD.size + 1))
@@ -343,7 +343,7 @@ def test_image_with_too_few_bytes_is_refused(wrong):
 
 
 def test_images_of_a_bag_are_those_of_a_topic_of_each_fluoroscope(tmp_path):
-    """It is the part of a name before the last, or its only one; plain images come first."""
+    """The name is the last part but one of the topic or its only part; plain images come first."""
     stamp = message_class('builtin_interfaces/msg/Time')(3, 7)
     header = message_class('std_msgs/msg/Header')(stamp, '')
     grey = np.arange(6, dtype=np.uint8).reshape(2, 3)
@@ -376,7 +376,7 @@ def test_images_of_a_bag_are_those_of_a_topic_of_each_fluoroscope(tmp_path):
 
 @pytest.fixture
 def queue(tmp_path, monkeypatch):
-    """A recording that does not begin, with a queue of 100 bytes."""
+    """A recording with a queue of 100 bytes that is not started."""
     monkeypatch.setattr(recording, 'SMALL_BYTES', 10)
     made = Recording(tmp_path / 'bag')
     made.options = Fake(queue_size=100 / 1e6)
@@ -428,7 +428,7 @@ def test_file_is_full_by_its_size_or_its_age(queue, monkeypatch, size, seconds, 
 
 
 def test_latched_messages_begin_every_file(queue):
-    """With the time of the message that follows them; the others are not repeated."""
+    """They get the time of the message that follows them; other messages are not repeated."""
     written = []
     queue._writer = Fake(
         split=lambda: written.append('split'),

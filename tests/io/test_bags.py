@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags: written as by rosbag2, reproducible, readable by others, and every fault reported."""
+"""Bags are written as by rosbag2, reproducible and readable by others; all faults are reported."""
 
 import io
 import os
@@ -61,7 +61,7 @@ def some_frames(number=6):
 
 
 def write_bag(path, frames=None, split_bytes=0, **options):
-    """split_bytes: size after which the next file is begun; 0: never."""
+    """Write a bag; split_bytes: size after which the next file begins, 0 for never."""
     with BagWriter(path, **options) as writer:
         for one in some_frames() if frames is None else frames:
             if split_bytes and writer.file_bytes >= split_bytes:
@@ -73,7 +73,7 @@ def write_bag(path, frames=None, split_bytes=0, **options):
 
 
 def message_of(function, *arguments):
-    """The sentence of the DataError that a call raises."""
+    """Return the sentence of the DataError that a call raises."""
     with pytest.raises(DataError) as caught:
         function(*arguments)
     assert '\n' not in str(caught.value)
@@ -91,7 +91,7 @@ def same(one, two):
 
 
 def assert_holds(source, frames):
-    """Check that a bag gives exactly these frames, in their order."""
+    """Check that a bag gives exactly these frames in this order."""
     read = read_frames(source).frames
     for name in {f.fluoroscope for f in frames}:
         wanted = [f for f in frames if f.fluoroscope == name]
@@ -110,9 +110,7 @@ def mcap_file(
     message_encoding='cdr',
     **options,
 ):
-    """An .mcap file with messages [(topic, log time, bytes)], written by the library of the
-    format's authors.
-    """
+    """Write an .mcap file of messages [(topic, log time, bytes)] by the library of its authors."""
     with open(path, 'wb') as file:
         writer = Writer(file, compression=compression, enable_crcs=False, **options)
         writer.start('ros2', 'someone else')
@@ -252,8 +250,8 @@ def test_frame_from_a_message_without_sigma():
     )
 
 
-# ---------------------------------------------------------------- the same bytes, as rosbag2
-# writes them
+# ---------------------------------------------------------------- the same bytes, as written
+# by rosbag2
 
 
 def test_same_messages_give_the_same_bytes(tmp_path):
@@ -345,7 +343,7 @@ def test_file_has_the_records_of_rosbag2(tmp_path):
 
 
 def test_type_hashes_agree_with_ros():
-    # From /opt/ros/jazzy/share/std_msgs/msg/*.json, and of ours as rosidl generates it.
+    # Expected hashes: /opt/ros/jazzy/share/std_msgs/msg/*.json, and rosidl's for our messages.
     assert (
         type_hash('std_msgs/msg/Header')
         == 'RIHS01_f49fb3ae2cf070f793645ff749683ac6b06203e41c891e17701b1cb597ce6a01'

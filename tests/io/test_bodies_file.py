@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""bodies.csv: what is written is read again, and every fault is named with its row."""
+"""bodies.csv: files are read as they were written, and every fault is named with its row."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ HEADER = 'body,marker,x,y,z,sd\n'
 
 
 def test_bodies_are_read_as_written(tmp_path):
-    """Also markers of unknown place, and places without a standard deviation."""
+    """Places may be unknown or have no standard deviation."""
     rng = np.random.default_rng(1)
     xyz = rng.normal(0, 30, (4, 3))
     xyz[2] = np.nan

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hostile input: sizes are looked at before anything is read or decoded; one sentence each."""
+"""Hostile input: sizes are checked before anything is read or decoded; one sentence each."""
 
 import io
 import os
@@ -29,7 +29,7 @@ MEGABYTES = 40
 
 
 def refused(function, *arguments):
-    """The message of the DataError, which is one line and came without much memory."""
+    """Return the message of the DataError; check that it is one line and took little memory."""
     tracemalloc.start()
     with pytest.raises(DataError) as caught:
         function(*arguments)
@@ -41,7 +41,7 @@ def refused(function, *arguments):
 
 
 def test_giant_file_is_not_read(tmp_path):
-    """Sparse, so that it costs nothing to make."""
+    """The file is sparse, so that it costs nothing to make."""
     path = tmp_path / 'observations.csv'
     with path.open('wb') as file:
         file.write(b'fluoroscope,exposure,target_id,u,v\n')
@@ -73,7 +73,7 @@ def test_yaml_aliases_are_refused(tmp_path):
 
 
 def test_chunk_that_would_be_giant_is_not_decompressed(tmp_path, monkeypatch):
-    """Whether its header says so or hides it."""
+    """Its header either states the size or hides it."""
     bomb = zstandard.compress(bytes(600 * 2**20))
     for claimed in (600 * 2**20, 1000):
         buffer = io.BytesIO()
@@ -111,7 +111,7 @@ def test_bag_of_very_many_channels_is_not_read(tmp_path):
 
 
 def changed_calibration(folder, compression=zipfile.ZIP_STORED, **members):
-    """The file of a calibration with other members."""
+    """Write a calibration file with some members replaced; return its path."""
     path = save_calibration(folder, calibrated('a', 5, model='none').calibrations['a'])
     with zipfile.ZipFile(path) as archive:
         content = {name: archive.read(name) for name in archive.namelist()}
@@ -147,18 +147,18 @@ def header(text):
     ],
 )
 def test_crafted_array_is_refused(tmp_path, members, sentence):
-    """In one sentence: numpy evaluates a header, and numbers this large overflow later."""
+    """It is refused in one sentence: numpy evaluates a header, and huge numbers overflow later."""
     assert sentence in refused(load_calibration, changed_calibration(tmp_path, **members))
 
 
 def test_compression_that_numpy_does_not_write_is_refused(tmp_path):
-    """A damaged LZMA member raised an exception of its own, and may claim 4 GB of dictionary."""
+    """A damaged LZMA member raises an exception of its own and may claim a dictionary of 4 GB."""
     path = changed_calibration(tmp_path, zipfile.ZIP_LZMA)
     assert 'compressed in a way that numpy does not use' in refused(load_calibration, path)
 
 
 def test_training_points_on_one_place_are_refused(tmp_path):
-    """No search tree divides them: each of 16,000 nodes of the grid would visit all."""
+    """A search tree cannot divide them: each of 16,000 nodes of the grid would visit them all."""
     count = limits.MAX_COINCIDENT + 1
     path = changed_calibration(
         tmp_path,
@@ -177,7 +177,7 @@ def test_message_of_an_error_is_one_short_line():
 
 @pytest.mark.parametrize('what', ['source', 'phantom', 'calibration', 'known'])
 def test_pipe_does_not_hang(tmp_path, capsys, what):
-    """A FIFO without writer would block for ever."""
+    """A FIFO without a writer would block forever."""
     os.mkfifo(tmp_path / 'pipe.csv')
     (tmp_path / 'result').mkdir()
     for name in ('a.calibration.npz', 'options.json'):

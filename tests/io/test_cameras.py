@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Formats of cameras: what other programs compute from the files is what we mean."""
+"""Formats of cameras: other programs compute from the files what this package means."""
 
 import json
 import sys
@@ -29,7 +29,7 @@ MM = FileSettings(image_size=SIZE, units='mm')
 
 
 def cameras():
-    """Two cameras that face the origin, off the axes; principal points off the centre."""
+    """Two cameras off the axes that face the origin; their principal points are off the centre."""
     out = []
     for name, position, c, xp, yp in (
         ('a', (300.0, -1100.0, 50.0), 4000.5, 520.25, 301.0),
@@ -47,7 +47,7 @@ def points_mm(count=30):
 
 
 def pixels(camera, points):
-    """Our own collinearity equations."""
+    """Return the pixels by our own collinearity equations."""
     matrix = camera.matrix
     interior = np.array([matrix[0, 2], matrix[1, 2], matrix[0, 0]])
     position = -camera.rotation.T @ camera.translation_mm
@@ -61,7 +61,7 @@ def pixels(camera, points):
 
 
 def triangulated(matrices, uv):
-    """OpenCV's triangulation from projection matrices (3, 4) and pixels (n, 2) of two cameras."""
+    """Return OpenCV triangulation from projection matrices (3, 4) and pixels (n, 2) of both."""
     found = cv2.triangulatePoints(*matrices, *(np.ascontiguousarray(p.T) for p in uv))
     return (found[:3] / found[3]).T
 
@@ -89,20 +89,20 @@ def assert_same(found, expected, tolerance=1e-9):
     ],
 )
 def test_cameras_return_from_every_format(tmp_path, kind, tolerance, units):
-    """In every unit; to the last digit where the format holds the numbers themselves."""
+    """Every unit is possible; the last digit is kept if the numbers themselves are stored."""
     settings = FileSettings(image_size=SIZE, units=units, fluoroscopes=('a', 'b'))
     registry.write(tmp_path / 'out', kind, Content(cameras=cameras()), settings)
     path = tmp_path / 'out'
     if kind == 'anipose':
         path = path.rename(tmp_path / 'calibration.toml')
-    # A translation of 17 digits is rounded once more when its decimal point moves.
+    # Moving the decimal point of a translation of 17 digits rounds it once more.
     tolerance = tolerance if units == 'mm' else max(tolerance, 1e-15)
     assert_same(registry.read(path, settings).cameras, cameras(), tolerance)
 
 
 @pytest.mark.parametrize('name', ['lab "2"', 'C:\\left', '\\"', 'plain'])
 def test_names_of_cameras_return_from_toml(tmp_path, name):
-    """Quotes and backslashes are escaped, once."""
+    """Quotes and backslashes are escaped exactly once."""
     given = (replace(cameras()[0], name=name), cameras()[1])
     path = tmp_path / 'calibration.toml'
     registry.write(path, 'anipose', Content(cameras=given), MM)
@@ -111,10 +111,10 @@ def test_names_of_cameras_return_from_toml(tmp_path, name):
 
 
 def autoscoper_mayacam2(path):
-    """Camera as Autoscoper's loader takes it: by the number of the line, y turned upwards.
+    """Return a camera as Autoscoper's loader reads it: by line number, with y turned upwards.
 
-    Returns image size, focal lengths, principal point with y upwards, the camera's axes in the
-    world as columns (x right, y up, z backwards) and its position.
+    The result is: image size, focal lengths, principal point with y upwards, the camera's axes in
+    the world as columns (x right, y up, z backwards), and its position.
     """
     lines = path.read_text().split('\n')
     assert lines[0] == 'image size'
@@ -133,7 +133,7 @@ def autoscoper_mayacam2(path):
 
 
 def test_autoscoper_sees_the_same_pixels(tmp_path):
-    """Its camera looks along -z with y upwards, its rows are counted from the bottom."""
+    """Its camera looks along -z with y upwards; its rows are counted from the bottom."""
     written = registry.write(tmp_path, 'mayacam2', Content(cameras=cameras()), MM)
     assert len(written.paths) == 2
     for camera in cameras():
@@ -141,7 +141,7 @@ def test_autoscoper_sees_the_same_pixels(tmp_path):
         size, (fx, fy), (cx, cy), axes, position = autoscoper_mayacam2(path)
         assert size == SIZE
         local = (points_mm() - position) @ axes
-        assert (local[:, 2] < 0).all()  # before a camera that looks along -z
+        assert (local[:, 2] < 0).all()  # in front of a camera that looks along -z
         column = cx - fx * local[:, 0] / local[:, 2]
         up = cy - fy * local[:, 1] / local[:, 2]
         expected = pixels(camera, points_mm())
@@ -166,7 +166,7 @@ def test_opencv_triangulates_our_points_from_mayacam(tmp_path):
 
 
 def test_mayacam2_with_distortion_returns(tmp_path):
-    """XMALab adds eight coefficients of OpenCV's model, one a line."""
+    """XMALab adds eight coefficients of OpenCV's model, one per line."""
     base = cameras()[0]
     distortion = (0.1, -0.2, 0.003, 0.004, 0.05, 0.0, 0.0, 0.0)
     camera = Camera('a', base.matrix, SIZE, base.rotation, base.translation_mm, distortion)
@@ -178,7 +178,7 @@ def test_mayacam2_with_distortion_returns(tmp_path):
 
 
 def xmalab_mayacam1(camera):
-    """The fifteen numbers that XMALab writes, step by step as its getMayaCam."""
+    """Return the fifteen numbers that XMALab writes, following its getMayaCam step by step."""
     height = SIZE[1]
     flip = np.diag([-1.0, 1.0, -1.0])
     r = flip @ camera.rotation
@@ -224,7 +224,7 @@ def test_coefficients_of_dlt_without_an_image_size_are_refused(tmp_path):
 
 
 def test_dlt_gives_pixels_from_one_upwards(tmp_path):
-    """By the eleven coefficients of XMALab and DLTdv: L1 X + L2 Y + L3 Z + L4 over the third."""
+    """XMALab and DLTdv define eleven coefficients: L1 X + L2 Y + L3 Z + L4 over the third row."""
     path = tmp_path / 'dlt.csv'
     registry.write(path, 'dlt', Content(cameras=cameras()), MM)
     table = np.loadtxt(path, delimiter=',')
@@ -238,7 +238,7 @@ def test_dlt_gives_pixels_from_one_upwards(tmp_path):
 
 
 def test_dlt_of_dltdv8_counts_rows_downwards(tmp_path):
-    """As DLTdv8 and easyWand6 do, from the first pixel, 1: found by the origin."""
+    """DLTdv8 and easyWand6 do this from the first pixel, 1; the origin shows it."""
     path = tmp_path / 'dlt.csv'
     from_one = np.array([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]])
     columns = []
@@ -258,7 +258,7 @@ def test_dlt_of_dltdv8_counts_rows_downwards(tmp_path):
 
 
 def test_anipose_file_projects_with_opencv(tmp_path):
-    """Rodrigues vector, translation and matrix as aniposelib gives them to cv2.projectPoints."""
+    """Rotation vector, translation and matrix as aniposelib gives them to cv2.projectPoints."""
     path = tmp_path / 'calibration.toml'
     registry.write(path, 'anipose', Content(cameras=cameras()), MM)
     document = tomllib.loads(path.read_text())
@@ -277,7 +277,7 @@ def test_anipose_file_projects_with_opencv(tmp_path):
 
 
 def test_camera_info_is_that_of_ros(tmp_path):
-    """Interior orientation only, with the entries that camera_info_manager parses."""
+    """It has the interior orientation only, with the entries that camera_info_manager parses."""
     written = registry.write(tmp_path, 'camera_info', Content(cameras=cameras()), MM)
     assert 'no position and attitude' in written.notes[0]
     document = yaml.safe_load((tmp_path / 'a_camera_info.yaml').read_text())
@@ -332,7 +332,7 @@ def test_wrong_mayacam2_names_the_row(tmp_path, row, text, sentence):
 
 
 def test_unit_is_never_silent(tmp_path):
-    """Asked for where a file does not say it; told where the usual one is written."""
+    """It is requested if a file does not state it, and reported if the usual unit is written."""
     written = registry.write(tmp_path, 'mayacam2', Content(cameras=cameras()), FileSettings())
     assert 'lengths in mm' in written.notes[0]
     with pytest.raises(

@@ -16,7 +16,7 @@ from fluoro_calib_ros.jobs.result_folder import save_result
 @pytest.mark.long
 @pytest.mark.parametrize('model', ['parametric', 'none', 'held'])
 def test_covariance_matrix_holds_the_precision_of_all_unknowns(model, tmp_path):
-    """With unknowns of the correction, without, and of an adjustment with a calibration held."""
+    """With or without unknowns of the correction, and with a fixed calibration."""
     result = rigs.calibrated('a', 6, model='none' if model == 'held' else model, max_iterations=2)
     if model == 'held':
         frames = {'a': rigs.exposures()['a'][6:10]}

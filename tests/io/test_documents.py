@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Documents of others: the worst ones of their size, and structures that grow."""
+"""Foreign documents: the worst cases of their size, and structures that grow."""
 
 import resource
 import subprocess
@@ -24,12 +24,12 @@ PARSE = {
     'JSON': documents.parse_json,
     'XML': documents.parse_xml,
 }
-# Texts are a quarter of the limit; if time grew as the square of the size, the limit would take 16
-# times as long.
+# Texts have a quarter of the size limit. If the time grew as the square of the size, the limit
+# would take 16 times as long.
 PART = 4
-CPU_S = 8  # the slowest takes 2.5
-MEMORY = 5 * 2**27  # bytes of address space
-# Text, of a format, that is repeated up to a quarter of its limit.
+CPU_S = 8  # limit of the CPU time [s]; the slowest takes 2.5 s
+MEMORY = 5 * 2**27  # address space [bytes]
+# Format, and text that is repeated up to a quarter of the size limit of the format.
 WORST = {
     'keys of many parts': ('TOML', 'a', '[{}' + '.k' * 90 + ']\n', ''),
     'empty tables': ('TOML', 'a=[', '{{}},', ']'),
@@ -127,7 +127,7 @@ def test_ordinary_documents_are_read(kind, text, value):
 
 
 def test_nested_file_of_opencv_is_refused(tmp_path):
-    """OpenCV ends the process."""
+    """OpenCV would end the process."""
     path = tmp_path / 'a_opencv.yaml'
     path.write_text('%YAML:1.0\n---\ncamera_matrix: ' + '[' * 200_000)
     with pytest.raises(DataError, match='nested too deeply'):

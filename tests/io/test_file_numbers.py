@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers and refusals of files at their limits, on the smallest content that has them."""
+"""Numbers and refusals of files at their limits, with the smallest content that reaches them."""
 
 import io
 import json
@@ -67,7 +67,7 @@ def test_options_of_a_calibration_are_read_or_refused(tmp_path, changes, is_wron
 
 
 class Video:
-    """A video of some images; it notes that it is released."""
+    """A video of some images, which records its release."""
 
     def __init__(self, images):
         self.images = list(images)
@@ -99,7 +99,7 @@ def test_video_may_lack_its_last_image(monkeypatch, number, count, is_cut):
 
 
 def setup(rate, length, exact):
-    """The setup of a cine file: a rate, the mark and length of the rest, and the exact rate."""
+    """Return the setup of a cine file: rate, mark and length of the extension, and exact rate."""
     content = bytearray(recordings.FRAME_RATE + 8)
     struct.pack_into('<H', content, 0, rate)
     struct.pack_into('<2sH', content, recordings.SETUP_MARK, b'ST', length)

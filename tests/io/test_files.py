@@ -48,7 +48,7 @@ from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)
-CALIBRATED = (256, 240)  # image of some_calibration: a small lookup grid
+CALIBRATED = (256, 240)  # size of the images of some_calibration, small for a small lookup grid
 OBSERVATIONS = 'fluoroscope,exposure,target_id,u,v,sigma\n'
 
 
@@ -59,7 +59,7 @@ def text_file(folder, name, text):
 
 
 def message_of(function, *arguments):
-    """The sentence of the DataError that a call raises."""
+    """Return the sentence of the DataError that a call raises."""
     with pytest.raises(DataError) as caught:
         function(*arguments)
     text = str(caught.value)
@@ -126,8 +126,8 @@ def some_calibration(name='a', n=400, **changes):
     return FluoroscopeCalibration(**{**values, **changes})
 
 
-# ---------------------------------------------------------------- every reader and files that are
-# none
+# ---------------------------------------------------------------- every reader, and files of
+# other kinds
 
 READERS = {
     'phantom': read_phantom,
@@ -163,7 +163,7 @@ def test_file_without_permission_is_reported_by_name(read, tmp_path, monkeypatch
     def refuse(*_, **__):
         raise PermissionError(
             13, 'Permission denied'
-        )  # root, as in containers, may read everything
+        )  # a mock, as root in containers may read everything
 
     monkeypatch.setattr('builtins.open', refuse)
     assert 'secret: cannot be read (permission denied)' in message_of(
@@ -297,7 +297,7 @@ def test_tables_that_are_no_text_are_named(tmp_path, start, remedy):
 )
 @pytest.mark.parametrize('name', ['points.tsv', 'points.csv'])
 def test_texts_of_other_programs_that_are_not_read_are_named(tmp_path, text, remedy, name):
-    """With what to do: by Qualisys Track Manager, Vicon Nexus and DLTdv8."""
+    """The message says what to do, for Qualisys Track Manager, Vicon Nexus and DLTdv8."""
     path = text_file(tmp_path, name, text)
     settings = FileSettings(image_size=(100, 100))
     for part, default in (('survey', 'phantom'), ('observations', 'observations')):
@@ -402,7 +402,7 @@ def test_observation_errors_name_row_and_cause(tmp_path, row, sentence):
 
 @pytest.mark.parametrize('off', [0, 1, 5, 6])
 def test_up_to_a_twentieth_of_the_points_may_be_off_the_image(tmp_path, off):
-    """Of 100; the first is named, and the others are counted."""
+    """Of 100 points, the first is named and the others are counted."""
     rows = [f'a,{i // 50},{i % 50},{2000 if 20 <= i < 20 + off else 7},1,\n' for i in range(100)]
     path = text_file(tmp_path, 'o.csv', OBSERVATIONS + ''.join(rows))
     if off == 6:
@@ -425,7 +425,7 @@ def test_row_number_is_exact_in_a_large_file(tmp_path):
 
 
 def test_large_file_is_read_block_by_block(tmp_path):
-    """Of several blocks, with the exposures across their borders."""
+    """The file has several blocks, and exposures that cross their borders."""
     frames = some_frames(135, 140)
     write_observations_csv(tmp_path / 'o.csv', frames)
     found = read_observations_csv(str(tmp_path / 'o.csv'), SIZE)
@@ -508,8 +508,8 @@ def test_numpy_reads_the_file_without_pickle_and_every_array_is_documented(tmp_p
 
 
 def changed(tmp_path, **arrays):
-    """Path of a calibration file in which some arrays are replaced, or left out where they are
-    None.
+    """Return the path of a calibration file in which some arrays are replaced, or removed if they
+    are None.
     """
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         arrays = {**{name: file[name] for name in file.files}, **arrays}
@@ -586,7 +586,7 @@ def test_invalid_calibration_is_refused(tmp_path, arrays, sentence):
 
 
 def test_calibration_of_an_earlier_version_gets_the_id_of_its_content(tmp_path):
-    """So does the orientation beside it, which names the calibrations that it belongs to."""
+    """So does the orientation next to it, which names the calibrations that it belongs to."""
     found = some_calibration()
     earlier = found.earlier_id
     assert (
@@ -619,7 +619,7 @@ def test_truncated_or_damaged_calibration_is_refused(tmp_path):
         )
     directory = bytearray(
         content
-    )  # is said to lie further behind than it does: its members before the file
+    )  # the end claims another offset: the members would begin before the file
     directory[-6:-2] = (int.from_bytes(content[-6:-2], 'little') + 999).to_bytes(4, 'little')
     assert 'or it is damaged' in message_of(
         load_calibration, text_file(tmp_path, 'a.calibration.npz', bytes(directory))
@@ -629,7 +629,7 @@ def test_truncated_or_damaged_calibration_is_refused(tmp_path):
         damaged[place] ^= 0x55
         text_file(tmp_path, 'a.calibration.npz', bytes(damaged))
         try:
-            again = load_calibration(path)  # a byte without a meaning, such as a date
+            again = load_calibration(path)  # the byte may have no meaning, as in a date
         except DataError:
             continue
         assert again.calibration_id == good.calibration_id

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Folders that are replaced as a whole: result folders and data sets, killed at any moment."""
+"""Folders are replaced as a whole: result folders and data sets, killed at any moment."""
 
 import gc
 import json
@@ -40,7 +40,7 @@ KIND = FolderKind('a test folder', parts=('own*',), marks=('own.txt',))
 
 @pytest.fixture(scope='module')
 def outcomes():
-    """Outcomes of two calibrations that differ in exposures and options."""
+    """Outcomes of two calibrations with different numbers of exposures."""
     made = []
     for count in (5, 6):
         result = calibrated('a', count, model='none')
@@ -52,7 +52,7 @@ def outcomes():
 
 
 def fork():
-    """Fork; the child never collects what other tests have left, such as contexts of ROS."""
+    """Fork; the child never collects the garbage of other tests, such as contexts of ROS."""
     gc.freeze()
     child = os.fork()
     if child:
@@ -61,7 +61,7 @@ def fork():
 
 
 def killed(work, seconds):
-    """Run work() in a process of its own, again and again, and kill it after a time."""
+    """Run work() repeatedly in a process of its own, and kill the process after some seconds."""
     child = fork()
     if not child:
         try:
@@ -75,7 +75,7 @@ def killed(work, seconds):
 
 
 def number_of_whole(path, outcomes):
-    """Which outcome a folder holds; fails for a mixture."""
+    """Return the number of the outcome that a folder holds; fail for a mixture."""
     calibrations = load_calibrations(path)
     read_request(path, calibrations)  # checks that the sources are those of the calibrations
     document = json.loads((path / 'result.json').read_text())
@@ -92,7 +92,7 @@ def hidden(path):
 
 @pytest.mark.long
 def test_killed_calibrations_leave_a_whole_folder(tmp_path, outcomes):
-    """Old or new at every kill, and so is the previous one; the next run cleans up."""
+    """At every kill, the folder and the previous one are old or new; the next run cleans up."""
     path = tmp_path / 'result'
     save_outcome(path, outcomes[0])
     rng = random.Random(1)
@@ -106,7 +106,7 @@ def test_killed_calibrations_leave_a_whole_folder(tmp_path, outcomes):
     start = time.monotonic()
     work()
     longest = 1.5 * (time.monotonic() - start)
-    # On a busy machine a kill may come after the work, or before it: those do not count.
+    # On a busy machine a kill may come before or after the work: those do not count.
     for kills in range(10 * KILLS):
         if kills >= KILLS and found == {0, 1} and leftovers > KILLS // 4:
             break
@@ -136,7 +136,7 @@ def test_killed_simulation_leaves_a_whole_data_set(tmp_path):
 
 
 def contents(path):
-    """Files by name, without hidden ones: what a killed run leaves, and the next one deletes."""
+    """Return files by name, but not hidden files: the next run deletes those of a killed one."""
     return {
         str(p.relative_to(path)): p.read_bytes()
         for p in path.rglob('*')
@@ -145,7 +145,7 @@ def contents(path):
 
 
 def test_terminated_command_leaves_nothing_unfinished(tmp_path):
-    """SIGTERM, as service managers send it."""
+    """Service managers send SIGTERM."""
     words = ['simulate', '--out', str(tmp_path / 'rig'), '--exposures', '5000']
     process = subprocess.Popen([sys.executable, '-m', 'fluoro_calib_ros.cli', *words], cwd=ROOT)
     pause = threading.Event()
@@ -186,7 +186,7 @@ def test_previous_folder_and_files_of_the_user_are_kept(tmp_path, outcomes):
 
 @pytest.mark.parametrize('stop', ['swap', 'old'])
 def test_run_killed_between_two_renames_is_finished_by_the_next(tmp_path, monkeypatch, stop):
-    """With and without a file system that can exchange two folders."""
+    """The file system can or cannot exchange two folders."""
     path = tmp_path / 'work'
     write(path, 'first')
     write(path, 'second')
@@ -235,7 +235,7 @@ def test_folder_that_must_stay_is_written_in_place(tmp_path, monkeypatch):
 
 
 def test_folder_with_folders_of_the_same_kind_stays(tmp_path):
-    """That of a node without namespace holds those of the namespaces."""
+    """The folder of a node without namespace contains those of the namespaces."""
     write(tmp_path / 'root' / 'rig', 'of the namespace')
     inode = os.stat(tmp_path / 'root').st_ino
     write(tmp_path / 'root', 'of no namespace')
@@ -268,7 +268,7 @@ def test_saved_calibrations_do_not_mix_with_another_result(tmp_path, outcomes):
 
 
 def test_output_that_would_destroy_something_is_refused(tmp_path, capsys):
-    """One sentence each, before anything is computed."""
+    """Each is refused in one sentence before anything is computed."""
     simulate(tmp_path / 'rig', SimulationOptions(1, 1, 0, 0.0))
     source, phantom = tmp_path / 'rig' / 'calibration', tmp_path / 'rig' / 'phantom.csv'
     foreign = tmp_path / 'home'

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags of a lab: other storages, numbers that begin again, a time window, pairing by stamp."""
+"""Bags of a lab: other storages, restarting numbers, a time window, and pairing by stamp."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +41,7 @@ def frames():
     ],
 )
 def test_other_storages_are_read(tmp_path, frames, storage, mode):
-    """sqlite3, and bags that are compressed file by file or message by message."""
+    """sqlite3, and bags that are compressed by file or by message."""
     bag = Writer(tmp_path / 'bag', version=9, storage_plugin=storage)
     if mode is not None:
         bag.set_compression(mode, CompressionFormat.ZSTD)
@@ -65,7 +65,7 @@ def test_other_storages_are_read(tmp_path, frames, storage, mode):
 
 
 def test_numbers_that_begin_again_become_different(tmp_path, frames):
-    """Camera software restarted between two series: the pairs stay pairs."""
+    """The camera software was restarted between two series: pairs stay pairs."""
     again = {
         name: [replace(f, stamp_ns=f.stamp_ns + 3600 * SECOND) for f in each]
         for name, each in frames.items()
@@ -100,7 +100,7 @@ def test_time_window(tmp_path, frames):
 
 
 def test_pairing_by_stamp(tmp_path, frames, capsys):
-    """Cameras that number independently of each other, and start at different times."""
+    """The cameras number their frames independently and start at different times."""
     shifted = {
         'a': frames['a'],
         'b': [

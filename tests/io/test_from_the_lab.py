@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From the tables of a lab to those of the next program, by the command line."""
+"""From the tables of a lab to the input of the next program, by the command line."""
 
 import csv
 import json
@@ -23,13 +23,13 @@ from fluoro_calib_ros.io.phantom import read_phantom
 from fluoro_calib_ros.jobs.sources import read_source, read_survey
 
 IMAGE = ('--image-size', '1024x1024')
-# The lookup grid of this model, which each command makes again, is made in no time.
+# Each command makes the lookup grid anew, which is quick for this model.
 FAST = ('--model', 'collocation', '--max-iterations', '2', '--fast')
 
 
 @pytest.fixture(scope='module')
 def lab(tmp_path_factory):
-    """A virtual lab: its XMALab tables with names, and the same as CSV of this package."""
+    """A virtual lab: its XMALab tables with names, and the same data as CSV of this package."""
     folder = tmp_path_factory.mktemp('lab')
     rig = folder / 'rig'
     options = ('--exposures', 5, '--test-exposures', 1, '--seconds', 0.02)
@@ -56,7 +56,7 @@ def result(lab):
 
 @pytest.fixture(scope='module')
 def reconstructed(lab, result):
-    """Points in space of the first exposures, as rows by frame and target."""
+    """Points in space of the first exposures, in rows by frame and target."""
     path = lab / 'space.csv'
     options = ('--calibration', result, '--out', path, '--fluoroscopes', 'a,b')
     assert run('reconstruct', lab / 'points.csv', *options) == 0
@@ -70,7 +70,7 @@ def rows_of(path):
 
 @pytest.mark.long
 def test_calibration_from_xmalab_is_the_same(lab, result, capsys):
-    """As from our own files, given the standard deviation that a frame specification lacks."""
+    """It equals that from our files with the deviation that frame specifications do not have."""
     phantom = rows_of(lab / 'phantom.csv')
     with open(lab / 'sd.csv', 'w') as file:
         writer = csv.DictWriter(file, phantom[0])
@@ -88,7 +88,7 @@ def test_calibration_from_xmalab_is_the_same(lab, result, capsys):
 
 
 def test_source_of_a_calibration_is_recognised_by_its_names(lab, result):
-    """What `validate --source` does: the observations have the digest of the calibration."""
+    """`validate --source` relies on it: the observations have the digest of the calibration."""
     calibrations = load_calibrations(result)
     known = FileSettings(names=read_names(result))
     recording = read_source(
@@ -101,7 +101,7 @@ def test_source_of_a_calibration_is_recognised_by_its_names(lab, result):
 
 
 def test_names_are_used_again_on_output(lab, reconstructed, capsys):
-    """In the points, and in the C3D file made of them."""
+    """They appear in the table of points, and in the C3D file made of it."""
     rows = rows_of(reconstructed)
     assert all(row['name'] == f'bead {int(row["target_id"]):03d}' for row in rows)
     path = lab / 'space.c3d'
@@ -113,7 +113,7 @@ def test_names_are_used_again_on_output(lab, reconstructed, capsys):
 
 
 def test_opencv_triangulates_our_points_from_mayacam(lab, result, reconstructed, capsys):
-    """From corrected image points and MayaCam files alone, which also give our residuals."""
+    """The corrected image points and the MayaCam files suffice, and also give our residuals."""
     mayacam = lab / 'mayacam'
     corrected = lab / 'corrected.csv'
     assert run('convert', result, '--to', 'mayacam2', '--out', mayacam, '--json') == 0
@@ -151,15 +151,15 @@ def test_opencv_triangulates_our_points_from_mayacam(lab, result, reconstructed,
         x = cv2.triangulatePoints(matrices['a'], matrices['b'], *(at[:, None] for at in uv))
         distances.append((float(row['residual']), np.linalg.norm(x[:3, 0] / x[3, 0] - xyz)))
     residual, distance = np.array(distances).T
-    # OpenCV does not weight the rays: the point is the same in so far as they meet, and rays
-    # beside each other have much the same weight.
+    # OpenCV does not weight the rays: its point is the same insofar as the rays meet, and
+    # neighbouring rays have similar weights.
     assert len(residual) > 100 and np.max(distance / residual) < 0.5
     assert distance.min() < 0.002
     capsys.readouterr()
 
 
 def test_lookup_table_maps_corrected_points_onto_the_observed_ones(lab, result, capsys):
-    """By cv2.remap's rule, between the pixels; -1 outside the calibrated area."""
+    """Between pixels, the rule of cv2.remap applies; -1 is outside the calibrated area."""
     assert run('convert', result, '--to', 'lut', '--out', lab / 'lut', '--fluoroscopes', 'a') == 0
     calibration = load_calibrations(result)['a']
     frames = read_source(lab / 'own.csv', image_size=(1024, 1024)).frames['a']
@@ -185,7 +185,7 @@ def test_lookup_table_maps_corrected_points_onto_the_observed_ones(lab, result, 
 
 
 def test_result_folder_fills_the_files_of_chow_et_al(lab, result, capsys):
-    """All four, from which the image points are computed again."""
+    """It fills all four, from which the image points are computed again."""
     assert run('convert', result, '--to', 'bundle', '--out', lab / 'chow', '--units', 'mm') == 0
     content = registry.read(lab / 'chow' / 'bundle.pho', FileSettings(units='mm'))
     frames = read_source(lab / 'own.csv', image_size=(1024, 1024)).frames
@@ -196,7 +196,7 @@ def test_result_folder_fills_the_files_of_chow_et_al(lab, result, capsys):
 
 
 def test_poses_of_the_phantom_agree_with_its_points(lab, result, reconstructed, capsys):
-    """The rigid body takes the survey to the reconstructed beads of the exposure."""
+    """The rigid body maps the survey to the reconstructed beads of the exposure."""
     path = lab / 'bodies.csv'
     assert run('convert', result, '--to', 'rigidbody', '--out', path, '--units', 'mm') == 0
     bodies = registry.read(path, FileSettings(units='mm')).bodies
@@ -211,7 +211,7 @@ def test_poses_of_the_phantom_agree_with_its_points(lab, result, reconstructed, 
 
 
 def test_correct_reads_points_of_xmalab(lab, result, capsys):
-    """A row a point, with the names."""
+    """The output has one row per point, with the names."""
     path = lab / 'corrected_rows.csv'
     names = ('cam1', 'cam2')
     frames = {
@@ -261,7 +261,7 @@ def test_output_that_is_no_file_is_refused_before_anything_is_written(lab, resul
     arguments = ('convert', lab / 'points.csv', *IMAGE, '--to')
     assert run(*arguments, 'observations', '--out', pipe) == 1
     assert pipe.is_fifo()
-    # Formats of several files fill a folder.
+    # Formats with several files fill a folder.
     (tmp_path / 'folder').mkdir()
     assert run('convert', result, '--to', 'mayacam2', '--out', tmp_path / 'folder') == 0
     assert len(list((tmp_path / 'folder').iterdir())) == 2

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A disk that is full or read-only, for real: what was there before is unchanged."""
+"""A disk that is really full or read-only: earlier files do not change."""
 
 import os
 import shutil
@@ -22,7 +22,7 @@ from fluoro_calib_ros.jobs.simulation import SimulationOptions, simulate
 STRING = 'std_msgs/msg/String'
 START = 10**18
 FREE_KB = (0, 4, 60)
-KEPT = 10  # messages that are on the disk before it is full
+KEPT = 10  # number of messages on the disk before it is full
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def rig(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def earlier(rig, tmp_path_factory):
-    """What earlier runs of the commands have written."""
+    """The files written by earlier runs of the commands."""
     path = tmp_path_factory.mktemp('earlier')
     for words in commands(rig, path):
         assert run(*words) == 0
@@ -48,7 +48,7 @@ def earlier(rig, tmp_path_factory):
 
 
 def commands(rig: Path, folder: Path):
-    """Arguments of commands that write results to a folder."""
+    """Return the arguments of commands that write results to a folder."""
     result, data = folder / 'result', folder / 'data'
     calibrate = ('calibrate', rig / 'calibration.csv', '--phantom', rig / 'phantom.csv')
     how = ('--image-size', '1024x1024', '--model', 'none', '--fast')
@@ -61,7 +61,7 @@ def commands(rig: Path, folder: Path):
 @pytest.mark.parametrize('free_kb', FREE_KB)
 @pytest.mark.long
 def test_command_on_a_full_disk_keeps_what_was_there(rig, earlier, disk, free_kb, capsys):
-    """Old results as they were, nothing unfinished, one sentence."""
+    """Old results do not change, nothing is unfinished, and there is one sentence."""
     shutil.copytree(earlier, disk.path, dirs_exist_ok=True)
     disk.leave(free_kb)
     before = disk.contents()
@@ -85,7 +85,7 @@ def test_command_on_a_read_only_disk_says_so(rig, disk, capsys):
 
 @pytest.mark.parametrize('free_kb', FREE_KB)
 def test_recording_on_a_full_disk_loses_no_more_than_it_says(tmp_path, disk, free_kb):
-    """What was recorded before can be recovered; every other message is counted as dropped."""
+    """Earlier messages can be recovered; every other message is counted as dropped."""
     disk.leave(free_kb)
     recording = Recording(disk.path / 'bag', RecordingOptions(flush_period=0.05))
     try:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""fluoro-calib correct for images: files, stacks, folders and videos, and wrong input."""
+"""fluoro-calib correct for images: files, stacks, folders and videos, and invalid input."""
 
 import io
 import json
@@ -40,7 +40,7 @@ LOSSLESS = [e for e in IMAGE_SUFFIXES if e not in ('.jpg', '.jpeg')]
 
 
 def image_of(number=0, dtype=np.uint8):
-    """An image of beads that move from frame to frame."""
+    """Return an image of beads that move from frame to frame."""
     return bead_image(np.add(BEADS, number), SIZE, dtype, seed=number)
 
 
@@ -49,7 +49,7 @@ def stack_of(count, dtype=np.uint8):
 
 
 def a_calibration(name):
-    """Calibration for small images."""
+    """Return a calibration for small images."""
     return rigs.smooth_pincushion(name, SIZE)
 
 
@@ -68,14 +68,14 @@ def one(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def both(tmp_path_factory):
-    """Folder with those of two."""
+    """Folder with the calibrations of two fluoroscopes."""
     folder = tmp_path_factory.mktemp('both')
     for name in 'ab':
         save_calibration(folder, a_calibration(name))
     return folder
 
 
-OLD_OPENCV = not SUPPORTS_16_BIT_VIDEOS  # before 4.7
+OLD_OPENCV = not SUPPORTS_16_BIT_VIDEOS  # OpenCV before 4.7
 
 
 def correct(source, calibration, out, *more):
@@ -101,7 +101,7 @@ def video_of(path, images, rate=29.97, codec='FFV1', colour=False):
 
 
 def frames_of(path, deep=False):
-    """Frames (n, h, w) and rate of a video."""
+    """Return the frames (n, h, w) and the rate of a video."""
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     video.set(cv2.CAP_PROP_CONVERT_RGB, int(not deep))
     frames = []
@@ -118,7 +118,7 @@ def frames_of(path, deep=False):
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 @pytest.mark.parametrize('ending', [e for e in LOSSLESS if e != '.bmp'] + ['.PNG'])
 def test_image_file(one, corrector, tmp_path, capfd, ending, dtype):
-    """Pixel for pixel, in 8 and 16 bits."""
+    """All pixels agree, in 8 and 16 bits."""
     image = image_of(0, dtype)
     out = tmp_path / f'out{ending}'
     (tmp_path / f'in{ending}').write_bytes(encode(image, ending.lower()))
@@ -139,7 +139,7 @@ def test_image_file(one, corrector, tmp_path, capfd, ending, dtype):
 
 
 def test_the_suffix_decides_the_format(one, corrector, tmp_path):
-    """From any to any; jpg loses little."""
+    """A bmp image is written in every format; jpg has a small loss."""
     (tmp_path / 'in.bmp').write_bytes(encode(image_of(), '.bmp'))
     for ending in IMAGE_SUFFIXES:
         out = tmp_path / f'out{ending}'
@@ -162,7 +162,7 @@ def test_cubic_is_another_image(one, corrector, tmp_path):
 
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 def test_stack(one, corrector, tmp_path, monkeypatch, dtype):
-    """Page by page, in batches of any size."""
+    """Pages are corrected one by one, in batches of any size."""
     monkeypatch.setattr('fluoro_calib_ros.io.image_reading.MAX_BATCH_BYTES', 3 * 128 * 96)
     pages = stack_of(8, dtype)
     assert cv2.imwritemulti(str(tmp_path / 'in.tif'), pages)
@@ -176,7 +176,7 @@ def test_stack(one, corrector, tmp_path, monkeypatch, dtype):
 @pytest.mark.parametrize('order', ['little', 'big'])
 @pytest.mark.parametrize('large', [False, True])
 def test_tiff_with_large_offsets(tmp_path, monkeypatch, large, order):
-    """Files beyond 4 GB and of either byte order: read by OpenCV, and their pages counted."""
+    """Files beyond 4 GB and of both byte orders are read by OpenCV and their pages counted."""
     if large:
         monkeypatch.setattr('fluoro_calib_ros.io.image_writing.CLASSIC_BYTES', 0)
     pages = stack_of(3, np.uint16)
@@ -193,8 +193,8 @@ def test_tiff_with_large_offsets(tmp_path, monkeypatch, large, order):
 
 
 def test_folder(one, corrector, tmp_path, capfd):
-    """All images of it, under their names; other files are skipped, and what is there already
-    stays.
+    """All of its images are corrected under their names; other files are skipped, and existing
+    files stay.
     """
     source = tmp_path / 'in'
     out = tmp_path / 'out'
@@ -222,7 +222,7 @@ def test_folder(one, corrector, tmp_path, capfd):
 
 
 def archive_of(folder):
-    """An archive of two trials: images, a stack and a video in folders of their own."""
+    """Write an archive of two trials: images, a stack and a video in folders of their own."""
     for trial in ('trial_1', 'trial_2/raw'):
         (folder / trial).mkdir(parents=True)
         for n in range(2):
@@ -233,7 +233,7 @@ def archive_of(folder):
 
 
 def content_of(folder):
-    """Bytes of all files of a tree by their names."""
+    """Return the bytes of all files of a tree by name."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob('*'))
@@ -243,7 +243,7 @@ def content_of(folder):
 
 @pytest.mark.long
 def test_archive_with_folders_on_two_processes(one, tmp_path, capfd):
-    """The folders in the folder, too; the same bytes with one process and with two."""
+    """Nested folders are included; one process and two write the same bytes."""
     source = archive_of(tmp_path / 'in')
     assert 'no images in this folder' in said(capfd, source, one, tmp_path / 'flat')
     for workers in ('1', '2'):
@@ -285,7 +285,7 @@ def test_folder_with_a_damaged_file_keeps_going_if_asked_to(one, tmp_path, capfd
 
 
 def test_folder_names_its_output_in_messages(one, tmp_path, capfd):
-    """Not the temporary folder."""
+    """The temporary folder is not named."""
     (tmp_path / 'in').mkdir()
     for name in ('x.avi', 'x.AVI.png'):
         (tmp_path / 'in' / name).write_bytes(encode(image_of(0, np.uint16), '.png'))
@@ -297,7 +297,7 @@ def test_folder_names_its_output_in_messages(one, tmp_path, capfd):
 
 
 def test_recordings_of_a_folder_get_a_format_that_is_written(tmp_path):
-    """Cine files become videos and DICOM files stacks; two files of one name are refused."""
+    """Cine files become videos and DICOM files stacks; clashing output names are refused."""
     for name in ('a.cine', 'b.dcm', 'c.mkv'):
         (tmp_path / name).write_bytes(b'x')
     assert [str(path) for path in list_images(tmp_path).written] == ['a.avi', 'b.tif', 'c.mkv']
@@ -316,8 +316,8 @@ def test_recordings_of_a_folder_get_a_format_that_is_written(tmp_path):
     ],
 )
 def test_video(one, corrector, tmp_path, ending, dtype, colour):
-    """Without loss, in 8 and 16 bits, with its frame rate; a video in colours that are all grey is
-    grey.
+    """Nothing is lost in 8 and 16 bits, and the frame rate is kept. A video in colours that are
+    all grey is read as grey.
     """
     images = stack_of(7, dtype)
     out = tmp_path / f'out{ending}'
@@ -330,7 +330,7 @@ def test_video(one, corrector, tmp_path, ending, dtype, colour):
 
 
 def test_video_as_mp4_and_as_a_stack(one, corrector, tmp_path):
-    """MP4 loses something; a stack does not."""
+    """MP4 is lossy; a stack is not."""
     images = stack_of(7)
     video_of(tmp_path / 'in.avi', images, rate=120)
     wanted = np.array([corrector.correct(image) for image in images])
@@ -368,7 +368,7 @@ def test_progress_is_reported(one, corrector, tmp_path):
 
 
 def test_progress_bar_only_on_a_terminal(one, tmp_path, capfd, monkeypatch):
-    """On standard error, and gone at the end."""
+    """It is on standard error, and gone at the end."""
     video_of(tmp_path / 'in.avi', stack_of(5))
 
     class Terminal(io.StringIO):
@@ -386,17 +386,17 @@ def test_progress_bar_only_on_a_terminal(one, tmp_path, capfd, monkeypatch):
 
 
 def said(capfd, *arguments):
-    """The one sentence with which the command fails."""
+    """Return the one sentence with which the command fails."""
     assert correct(*arguments) == 1
     out, err = capfd.readouterr()
-    if OLD_OPENCV:  # it prints errors of its own
+    if OLD_OPENCV:  # this version prints errors of its own
         err = err.splitlines(keepends=True)[-1]
     assert out == '' and err.startswith('fluoro-calib correct: ') and err.count('\n') == 1
     return err
 
 
 def tiff_of(pages):
-    """Bytes of a stack as it is written here."""
+    """Return the bytes of a stack as this package writes it."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / 'stack.tif'
         source = ImageSource('stack', len(pages), iter([('', page) for page in pages]))
@@ -405,7 +405,7 @@ def tiff_of(pages):
 
 
 def in_a_circle(content):
-    """A TIFF file whose last page is followed by its first one."""
+    """Return a TIFF file whose last page links to its first."""
     content = bytearray(content)
     first = position = struct.unpack_from('<I', content, 4)[0]
     while position:
@@ -423,13 +423,13 @@ def flipped(content):
 
 PNG = encode(image_of(), '.png')
 PLAIN_TIF = tiff_of(stack_of(4, np.uint16))
-TIF = PLAIN_TIF  # OpenCV writes stacks from 4.7 on, compressed
+TIF = PLAIN_TIF  # compressed, as OpenCV writes stacks from 4.7 on
 if hasattr(cv2, 'imencodemulti'):
     TIF = cv2.imencodemulti('.tif', stack_of(4, np.uint16))[1].tobytes()
 COLOUR = cv2.imencode('.png', np.stack([image_of(), image_of(1), image_of(2)], axis=-1))[
     1
 ].tobytes()
-BAD = {  # file: content, what is said
+BAD = {  # file: content, message
     'no.xyz': (b'x', 'files with the ending .xyz cannot be read'),
     'text.png': (b'this is text', 'no image that can be decoded, or it is damaged'),
     'empty.png': (b'', 'the file is empty'),
@@ -461,7 +461,7 @@ BAD = {  # file: content, what is said
 
 @pytest.mark.parametrize('name', BAD)
 def test_bad_source(one, tmp_path, capfd, name):
-    """One sentence with its name; an earlier file stays, and nothing else is left."""
+    """One sentence has its name; an earlier file stays, and nothing else is left."""
     content, sentence = BAD[name]
     source = tmp_path / name
     out = tmp_path / f'out.{name.rpartition(".")[2]}'
@@ -483,7 +483,7 @@ def test_cut_video(one, tmp_path, capfd, ending, codec):
 
 
 def test_bad_image_among_good_ones(one, tmp_path, capfd):
-    """In a folder, a stack or a video: the error names its place, and nothing is written."""
+    """In a folder, stack or video, the error names the place of the image; nothing is written."""
     source = tmp_path / 'in'
     out = tmp_path / 'out'
     source.mkdir()
@@ -499,7 +499,7 @@ def test_bad_image_among_good_ones(one, tmp_path, capfd):
 
 
 def test_impossible_outputs_are_refused(one, both, tmp_path, capfd):
-    """Outputs that cannot hold the images, or would overwrite the source."""
+    """Such outputs cannot hold the images or would overwrite the source."""
     eight, deep, stack, video = (tmp_path / n for n in ('8.png', '16.png', 's.tif', 'v.avi'))
     eight.write_bytes(encode(image_of(), '.png'))
     deep.write_bytes(encode(image_of(0, np.uint16), '.png'))
@@ -535,8 +535,8 @@ def test_impossible_outputs_are_refused(one, both, tmp_path, capfd):
 
 
 def test_file_names_that_are_not_utf8(one, tmp_path, capfd):
-    """An image may have one; what OpenCV reads or writes by its name may not: it would end the
-    process.
+    """They are accepted for images, but not for files that OpenCV reads or writes by name, which
+    would end the process.
     """
     odd = [tmp_path / os.fsdecode(b'\xff' + ending) for ending in (b'.png', b'.tif', b'.avi')]
     odd[0].write_bytes(encode(image_of(), '.png'))
@@ -556,7 +556,7 @@ def test_file_names_that_are_not_utf8(one, tmp_path, capfd):
 
 
 def test_folder_in_place_of_an_image(one, tmp_path, capfd):
-    """All or nothing: no image is replaced where one of them cannot be."""
+    """All or nothing: no image is replaced if one of them cannot be."""
     (tmp_path / 'in').mkdir()
     (tmp_path / 'out' / 'b.png').mkdir(parents=True)
     for name in ('a.png', 'b.png'):
@@ -571,7 +571,7 @@ def test_folder_in_place_of_an_image(one, tmp_path, capfd):
 
 
 def test_odd_sizes_of_videos(tmp_path):
-    """OpenCV would cut the last row off."""
+    """OpenCV would cut off the last row."""
     calibration = replace(a_calibration('a'), image_size=(128, 95))
     cv2.imwritemulti(str(tmp_path / 'x.tif'), [image_of()[:95]] * 2)
     with pytest.raises(DataError, match='a stack cannot be'):
@@ -593,7 +593,7 @@ def test_images_of_a_video_are_corrected_each_at_its_angle(turning, tmp_path, ca
     images = stack_of(4)
     cv2.imwritemulti(str(tmp_path / 'trial.tif'), images)
     angles = tmp_path / 'angles.csv'
-    angles.write_text('image,angle_deg\n2,-30\n1,40\n4,\n')  # the third one has no row
+    angles.write_text('image,angle_deg\n2,-30\n1,40\n4,\n')  # there is no row for image 3
     out = tmp_path / 'out.tif'
     assert correct(tmp_path / 'trial.tif', turning, out, '--angles', angles) == 0
     assert '2 of 4 images have no angle in' in capsys.readouterr().err

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Angles of the C-arm in frames of a bag, from joint states."""
+"""Angles of the C-arm in the frames of a bag, from joint states."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def frames_of(name, count=5):
 
 
 def write_bag(path, states, frames=None):
-    """Write frames of a and b, then states (topic, stamp, names, positions): out of order."""
+    """Write frames of a and b, then out-of-order states (topic, stamp, names, positions)."""
     with BagWriter(path) as writer:
         for frame in frames or (*frames_of('a'), *frames_of('b')):
             writer.write_frame(frame)
@@ -144,7 +144,7 @@ def converted(path, *words):
 
 
 def test_convert_writes_the_angles_of_a_bag(tmp_path, capsys, monkeypatch):
-    """By the flag and by rig.toml; what is calibrated from the file has them."""
+    """They are selected by the flag or by rig.toml, and calibrations from the file use them."""
     bag = write_bag(tmp_path / 'bag', STATES[:2])
     words = (bag, '--angle-joint', 'carm', '--angle-max-age', 0.05)
     frames = converted(tmp_path / 'o.csv', *words)
@@ -251,7 +251,7 @@ def test_command_line_reads_the_angles_of_a_bag(tmp_path, capsys):
     [('carm', [0.1, 0.2, 0.2]), ('a:carm', [0.1, 0.2, 0.2]), ('', [None] * 3)],
 )
 def test_images_of_a_bag_get_the_position_of_the_last_state(tmp_path, joint, angles):
-    """Of the joint of their fluoroscope."""
+    """The state is that of the joint of their fluoroscope."""
     header = message_class('std_msgs/msg/Header')
     time = message_class('builtin_interfaces/msg/Time')
     grey = np.full((4, 6), 7, np.uint8)

@@ -55,7 +55,7 @@ def written(tmp_path, text):
 
 
 def test_joints_are_read(tmp_path):
-    """Frames from landmarks, axes, a matrix and a quaternion."""
+    """Frames are given by landmarks, axes, a matrix and a quaternion."""
     knee, ankle = read_joints(written(tmp_path, KNEE + ANKLE), BODIES)
     assert knee.neutral == (3, 40) and ankle.neutral is None
     assert (knee.joint.name, knee.joint.proximal, knee.joint.distal) == ('knee', 'femur', 'tibia')
@@ -151,7 +151,7 @@ def test_wrong_files_are_refused(tmp_path, text, cause):
 
 
 def test_motion_of_joints_is_written(tmp_path):
-    """One row for each joint and exposure; empty cells where it is unknown."""
+    """There is one row for each joint and exposure; cells are empty if the motion is unknown."""
     count = 3
     angles = np.array([[0.5, -0.25, 7.0], [np.nan] * 3, [0.1, 0.2, 0.3]])
     covariance = np.tile(np.diag([1e-4, 4e-4, 9e-4, 0.01, 0.04, 0.09]), (count, 1, 1))

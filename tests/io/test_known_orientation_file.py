@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Known orientations are read with care, whatever program wrote K, R and t."""
+"""Known orientations are checked when read, whatever program wrote K, R and t."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Limits of what is read: each is refused in one sentence, before anything is decoded."""
+"""Limits of reading: what exceeds them is refused in one sentence before anything is decoded."""
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ from fuzz.seeds import orientation
 
 @pytest.fixture
 def limited():
-    """Set limits, which are the default ones again after the test."""
+    """Yield a function that sets limits; the default limits return after the test."""
     yield lambda **changes: use_read_limits(ReadLimits(**changes))
     use_read_limits(ReadLimits())
 
@@ -41,7 +41,7 @@ def refused(function, *arguments):
 
 
 def some_calibration(count=30):
-    """A calibration with so many training points."""
+    """Return a calibration with `count` training points."""
     uv = np.random.default_rng(1).uniform(0, 64, (count, 2))
     return FluoroscopeCalibration(
         fluoroscope='a',

@@ -13,7 +13,7 @@ NAMES = Names({'tib, lat': 4, 'fem "a"': 2}, {'trial 3.tif': 3}, {'Röntgen 1': 
 
 
 def test_names_return(tmp_path):
-    """Also those with commas and quotes; without names there is no file."""
+    """Names may contain commas and quotes; without names there is no file."""
     write_names(tmp_path, NAMES)
     assert read_names(tmp_path) == NAMES
     write_names(tmp_path, Names())

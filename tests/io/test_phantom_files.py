@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Phantoms as they are shared: lists of coordinates, their faults, and files from drawings."""
+"""Phantoms as they are exchanged: lists of coordinates, their faults, and files from drawings."""
 
 import numpy as np
 import pytest
@@ -183,7 +183,7 @@ def test_the_command_writes_file_and_picture(tmp_path, capsys):
     assert len(phantom.target_id) == 29
     assert phantom.diameter_mm.tolist() == [3.0] * 29
     picture = (tmp_path / 'sheet.svg').read_text()
-    assert '>8<' in picture  # the blocked one
+    assert '>8<' in picture  # the blocked hole
     assert '>30<' in picture
     words = ('--pitch', 20, '--picture', tmp_path / 'cube.png', '--out', tmp_path / 'cube.csv')
     assert rigs.run('phantom', '--cube', '3x3x3', *words) == 0

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Formats of image points, phantoms, points in space and poses: written, read, refused."""
+"""Formats of image points, phantoms, points in space and poses: written, read, and refused."""
 
 import csv
 import dataclasses
@@ -44,7 +44,7 @@ SETTINGS = FileSettings(image_size=SIZE, units='mm')
 
 
 def frames(sigma=False, numbers=(1, 3)):
-    """Two fluoroscopes, some targets not seen, an exposure left out."""
+    """Return frames of two fluoroscopes; some targets are not seen and an exposure is missing."""
     rng = np.random.default_rng(5)
     out = {}
     for name, seen in (('cam1', [7, 8, 9]), ('cam2', [8, 9, 12])):
@@ -89,7 +89,7 @@ def refused(path, settings=SETTINGS, kind=None):
 
 
 def test_names_numbered_alike_have_their_numbers():
-    """So that a phantom and a recording agree that do not know of each other."""
+    """Thus a phantom and a recording that were named independently agree."""
     assert number_names(['bead12', 'bead03']) == {'bead12': 12, 'bead03': 3}
     assert number_names(['cam1_0017.tif', 'cam1_0004.tif']) == {
         'cam1_0017.tif': 17,
@@ -127,7 +127,7 @@ def test_fluoroscopes_get_names_that_files_and_topics_may_have():
     ],
 )
 def test_points_of_dltdv_and_argus_have_their_origin(tmp_path, header, given, expected, notes):
-    """Their names tell the program, and a note the flags where none is given."""
+    """The names reveal the program, and a note names the flags if none is given."""
     path = tmp_path / 'xypts.csv'
     path.write_text(f'{header}\nNaN,NaN\n10,20\n')
     content = registry.read(path, FileSettings(image_size=SIZE, **given))
@@ -139,7 +139,7 @@ def test_points_of_dltdv_and_argus_have_their_origin(tmp_path, header, given, ex
 @pytest.mark.parametrize('one_based', [False, True])
 @pytest.mark.parametrize('y_up', [False, True])
 def test_xmalab_points_return(tmp_path, one_based, y_up):
-    """In all variants of XMALab's dialogue."""
+    """All variants of XMALab's dialogue are tested."""
     path = tmp_path / 'points.csv'
     settings = FileSettings(image_size=SIZE, one_based=one_based, y_up=y_up)
     registry.write(path, 'xmalab2d', Content(observations=frames()), settings)
@@ -173,7 +173,7 @@ labeled-data,cam2_run1,img0012.png,,,3,4
 
 
 def test_points_predicted_by_deeplabcut(tmp_path):
-    """Frames from 0; what DeepLabCut itself takes for unseen is not used."""
+    """Frames count from 0; points that DeepLabCut itself considers unseen are not used."""
     path = tmp_path / 'camADLC_resnet50_kneeMay1shuffle1_50000.csv'
     path.write_text(PREDICTED)
     content = registry.read(path, SETTINGS)
@@ -184,7 +184,7 @@ def test_points_predicted_by_deeplabcut(tmp_path):
     assert second.target_id.tolist() == [2]
     np.testing.assert_allclose(first.sigma, [1 / 0.99, 1 / 0.98])
     assert '2 points with a likelihood below 0.6' in content.notes[0]
-    # As DeepLabCut itself reads it.
+    # Compare with the way in which DeepLabCut itself reads the file.
     table = pandas.read_csv(path, header=[0, 1, 2], index_col=0)
     assert table.iloc[0].xs('fem', level='bodyparts').tolist()[:2] == first.uv[1].tolist()
 
@@ -209,7 +209,7 @@ def test_a_folder_of_deeplabcut_returns(tmp_path):
     assert table.loc[3].xs('pat', level='bodyparts').tolist() == [*uv[2], 1.0]
     content = registry.read(tmp_path / 'points', FileSettings(image_size=SIZE, names=names))
     assert_same_frames(content.observations, given.observations)
-    # Without known ids, a name has one id in both files.
+    # Without known ids, a name still has the same id in both files.
     new = registry.read(tmp_path / 'points', SETTINGS)
     assert sorted(new.names.targets) == sorted(names.targets)
     for name, own in new.observations.items():
@@ -255,7 +255,7 @@ def with_attributes(item, **attributes):
 
 
 def stored(columns):
-    """The axis of columns as pandas stores it: instructions of protocol 0, each text once."""
+    """Return the column axis as pandas stores it: protocol 0 instructions, with each text once."""
     known = {}
 
     def cell(name):
@@ -271,7 +271,7 @@ def stored(columns):
 
 
 def pandas_table(path, text, axes=None):
-    """The table of a CSV file as DeepLabCut stores predictions: to_hdf with format='table'."""
+    """Write a CSV table as DeepLabCut stores predictions: by to_hdf with format='table'."""
     rows = [line.split(',') for line in text.splitlines()]
     columns = list(zip(*(row[1:] for row in rows[:3])))
     values = np.array([[float(cell or 'nan') for cell in row[1:]] for row in rows[3:]])
@@ -286,7 +286,7 @@ def pandas_table(path, text, axes=None):
 
 
 def pandas_fixed(path, text, **attributes):
-    """The table of a CSV file as DeepLabCut stores labels: to_hdf, with levels of both axes."""
+    """Write a CSV table as DeepLabCut stores labels: by to_hdf, with levels of both axes."""
     rows = [line.split(',') for line in text.splitlines()]
     headers = sum(not row[1] for row in rows)
     axes = {
@@ -325,7 +325,7 @@ def test_hdf5_of_deeplabcut_is_what_its_csv_is(tmp_path, write, text):
 
 
 def test_no_code_of_a_file_of_deeplabcut_is_run(tmp_path):
-    """Instructions that make a file where they are carried out: open(path, 'w')."""
+    """The instructions, open(path, 'w'), would make a file if they were executed."""
     axes = f'(l(I1\ncbuiltins\nopen\n(V{tmp_path / "trapped"}\nVw\ntRta.'
     path = pandas_table(tmp_path / 'a.h5', PREDICTED, axes)
     with pytest.raises(DataError, match='its columns are stored by GLOBAL, which is not read'):
@@ -363,7 +363,7 @@ SLEAP_SCORES = np.array([[[1.0, 0.5], [0.8, 0.0]], np.full((2, 2), np.nan), [[1,
 
 
 def sleap_file(path, order, named=True, **others):
-    """An analysis file as SLEAP writes it, or as sleap-io with other orders of the axes."""
+    """Write an analysis file as SLEAP does, or as sleap-io does with another order of the axes."""
     axes = ('frame', 'track', 'node', 'xy')
     with h5py.File(path, 'w') as file:
         tracks = file.create_dataset(
@@ -456,7 +456,7 @@ def test_names_of_markers_return(tmp_path):
 
 
 def test_offset_columns_of_xmalab_are_read(tmp_path):
-    """XMALab does not separate them in the header; other programs do."""
+    """XMALab does not separate them in the header, but other programs do."""
     path = tmp_path / 'points.csv'
     for header in (
         'cam0_offsetcam1_offsetm1_cam1_X,m1_cam1_Y,m1_cam2_X,m1_cam2_Y',
@@ -470,7 +470,7 @@ def test_offset_columns_of_xmalab_are_read(tmp_path):
 
 
 def test_semicolons_with_decimal_commas_are_recognised(tmp_path):
-    """As a spreadsheet writes a table in many countries."""
+    """Spreadsheets write tables like this in many countries."""
     path = tmp_path / 'points.csv'
     path.write_text('Frame;m1_cam1_X;m1_cam1_Y\n4;1,5;2,25\n9;nan;nan\n')
     (frame,) = registry.read(path, SETTINGS).observations['cam1']
@@ -534,7 +534,7 @@ def test_frame_specification_returns(tmp_path, units):
 
 
 def test_frame_specification_of_a_lab_is_read(tmp_path):
-    """In cm unless told otherwise; factors, white beads, rows without names."""
+    """Lengths are in cm by default; factors, white beads and rows without names are read."""
     path = tmp_path / 'frame.csv'
     beads = '0,0,1.5\n1,0,0\n0,1,0\n1,1,1\n'
     for header, factor in (('x y z', 10), ('white', 10), ('s2,s2,s2,x', 20), ('x,y,z', 10)):
@@ -589,7 +589,7 @@ def test_files_of_chow_et_al_return(tmp_path):
 
 
 def test_files_of_chow_et_al_satisfy_its_collinearity_equations(tmp_path):
-    """Of its source, x = xp - c X/Z and y = yp - c Y/Z, with omega, phi, kappa."""
+    """They are those of its source, x = xp - c X/Z and y = yp - c Y/Z, with omega, phi, kappa."""
     registry.write(tmp_path, 'bundle', chow_content(), SETTINGS)
     iop = np.loadtxt(tmp_path / 'bundle.iop')
     eop = np.loadtxt(tmp_path / 'bundle.eop')
@@ -642,7 +642,7 @@ NAMED = Names({'tib lat': 1, 'tib med': 2, 'fem': 5})
 
 
 def test_c3d_is_read_by_ezc3d(tmp_path):
-    """Names, unit, rate, first frame, coordinates, residual; a gap is a residual of -1."""
+    """Names, unit, rate, first frame, coordinates and residual agree; a gap has residual -1."""
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
     file = ezc3d.c3d(str(path))
@@ -659,7 +659,7 @@ def test_c3d_is_read_by_ezc3d(tmp_path):
 
 
 def test_scale_and_residuals_of_c3d_are_where_the_user_guide_has_them(tmp_path):
-    """As py-c3d reads them: the low byte of the fourth word; the high one tells the cameras."""
+    """As in py-c3d, the fourth word has the residual in its low byte, cameras in its high one."""
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
     content = path.read_bytes()
@@ -676,13 +676,13 @@ def test_scale_and_residuals_of_c3d_are_where_the_user_guide_has_them(tmp_path):
 
 
 def dec(values):
-    """Numbers as DEC processors have them: halves interchanged, the exponent larger by two."""
+    """Return numbers in the format of DEC processors: swapped halves, exponent larger by two."""
     return (values.astype('<f4') * 4).view('<u2').reshape(-1, 2)[:, ::-1].tobytes()
 
 
 @pytest.mark.parametrize('kind', ['float', 'integer', 'DEC float'])
 def test_residuals_of_cameras_are_read_from_c3d(tmp_path, kind):
-    """As Vicon and Qualisys write them, with a mask of cameras in the high byte."""
+    """Vicon and Qualisys write them with a mask of cameras in the high byte."""
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
     content = bytearray(path.read_bytes())
@@ -699,7 +699,7 @@ def test_residuals_of_cameras_are_read_from_c3d(tmp_path, kind):
         as_bytes = dec
         content[(content[0] - 1) * 512 + 3] = 85
     content[(data - 1) * 512 :] = as_bytes(values).ljust(512, b'\0')
-    place = content.index(b'SCALE') + 9  # behind the offset of 2 bytes, type and dimensions
+    place = content.index(b'SCALE') + 9  # after the offset of 2 bytes, type and dimensions
     content[12:16] = content[place : place + 4] = as_bytes(np.array([scale], dtype='<f4'))
     path.write_bytes(content)
     found = registry.read(path, FileSettings()).points
@@ -709,12 +709,12 @@ def test_residuals_of_cameras_are_read_from_c3d(tmp_path, kind):
 
 
 def test_damaged_c3d_is_refused(tmp_path):
-    """A truncated file, and one whose parameters make ezc3d fail."""
+    """One file is truncated; the parameters of the other make ezc3d fail."""
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
     whole = path.read_bytes()
     count, _, first, last = struct.unpack_from('<4H', whole, 2)
-    end = (whole[16] - 1) * 512 + (last - first + 1) * count * 16  # four float32 a point
+    end = (whole[16] - 1) * 512 + (last - first + 1) * count * 16  # four float32 per point
     for length in (100, 700, end - 1):
         path.write_bytes(whole[:length])
         assert 'this C3D file is truncated' in refused(path)
@@ -739,7 +739,7 @@ def test_points_in_space_return(tmp_path, kind):
     assert content.points.rate_hz == (None if kind == 'xmalab3d' else 200)
 
 
-# opensim changes the environment of its process, so that no ROS process starts from it any more.
+# opensim changes the environment of its process such that no ROS process can start from it.
 READ_BY_OPENSIM = """
 import json, sys
 import opensim
@@ -758,7 +758,7 @@ json.dump({
 
 
 def test_trc_is_read_by_opensim(tmp_path):
-    """Labels, unit, rate, times and coordinates; a gap is NaN there."""
+    """Labels, unit, rate, times and coordinates agree; a gap is NaN."""
     if sys.version_info < (3, 11):
         pytest.skip('opensim has no wheel for Python 3.10')
     path = tmp_path / 'points.trc'
@@ -816,7 +816,7 @@ def test_trc_without_frames_is_refused(tmp_path):
 
 
 def test_xmalab_3d_points_of_a_lab_are_read(tmp_path):
-    """Without the column Frame, NaN where a marker is not seen, and no unit."""
+    """There is no column Frame and no unit; a marker that is not seen is NaN."""
     path = tmp_path / 'points.csv'
     path.write_text('m1_X,m1_Y,m1_Z,m2_X,m2_Y,m2_Z\n1,2,3,NaN,NaN,NaN\n4,5,6,7,8,9\n')
     found = registry.read(path, FileSettings(units='cm')).points
@@ -855,7 +855,7 @@ def test_matrix_that_is_no_rotation_is_refused(tmp_path):
 
 
 def moving_bodies(rate=250.0):
-    """Two bodies in frames 4, 5 and 7; the second has no pose in the second one."""
+    """Return two bodies in frames 4, 5 and 7; in frame 5 the second body has no pose."""
     rng = np.random.default_rng(4)
     turn = Rotation.random(6, random_state=rng).as_matrix().reshape(3, 2, 3, 3)
     shift = np.round(rng.uniform(-200, 200, (3, 2, 3)), 4)
@@ -864,7 +864,7 @@ def moving_bodies(rate=250.0):
 
 
 def test_rotations_of_c3d_are_read_by_ezc3d(tmp_path):
-    """Alone or beside points; frame 6 has none. What ezc3d reads is read here, too."""
+    """Bodies may come with points; frame 6 has no poses. We read the same values as ezc3d."""
     path = tmp_path / 'bodies.c3d'
     bodies = moving_bodies(200.0)
     for content in (Content(bodies=bodies), Content(bodies=bodies, points=points(), names=NAMED)):
@@ -907,7 +907,7 @@ def test_rotation_of_c3d_that_is_none_is_refused(tmp_path):
 
 
 def test_tracking_of_autoscoper(tmp_path):
-    """Rows of matrices, row by row; a row for every frame, NaN where there is no pose."""
+    """The matrices are written row by row; every frame has a row, which is NaN without a pose."""
     path = tmp_path / 'trial.tra'
     bodies = moving_bodies(None)
     written = registry.write(path, 'autoscoper', Content(bodies=bodies), FileSettings(units='mm'))
@@ -944,7 +944,7 @@ json.dump(out, sys.stdout)
 
 
 def by_opensim(script, folder, *paths):
-    """Return what a script that runs with opensim writes as JSON."""
+    """Run a script with opensim and return what it writes as JSON."""
     if sys.version_info < (3, 11):
         pytest.skip('opensim has no wheel for Python 3.10')
     done = subprocess.run(
@@ -958,7 +958,7 @@ def by_opensim(script, folder, *paths):
 
 
 def test_poses_are_read_by_opensim(tmp_path):
-    """Orientations and positions in metres; NaN in frame 6 and where a body has no pose."""
+    """Orientations, and positions in metres, are NaN in frame 6 and where a body has no pose."""
     bodies = moving_bodies()
     written = registry.write(
         tmp_path / 'poses.sto', 'opensim', Content(bodies=bodies), FileSettings()
@@ -981,7 +981,7 @@ def test_poses_are_read_by_opensim(tmp_path):
 
 
 def joint_of_two(name, count=3):
-    """Motion of a knee, unknown in the second exposure."""
+    """Return the motion of a knee that is unknown in the second exposure."""
     angles = np.array([[0.5, -0.25, 7.0], [np.nan] * 3, [0.1, 0.2, 0.3]])
     return JointMotion(
         Joint(name, 'femur', 'tibia', 'grood_suntay_knee', side='left'),
@@ -1014,7 +1014,7 @@ json.dump({
 
 
 def test_joint_motion_is_read_by_opensim(tmp_path):
-    """By both of its readers; an exposure in which it is unknown is left out."""
+    """Both of its readers are tested; an exposure with an unknown motion is omitted."""
     path = tmp_path / 'joints.mot'
     motions = [joint_of_two('knee_l'), joint_of_two('knee_r')]
     write_joint_motion(path, motions, 10**18)
@@ -1049,7 +1049,7 @@ POSE_HEADER = 'body,exposure,time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw,status\n'
 
 
 def test_poses_of_bodies_are_read(tmp_path):
-    """Any order of rows; a body without a pose in an exposure, or without a row."""
+    """Rows may have any order; a body may have no pose or no row in an exposure."""
     path = tmp_path / 'poses.csv'
     half = repr(0.5**0.5)
     path.write_text(
@@ -1100,7 +1100,7 @@ def test_rate_is_that_of_the_stamps_also_where_exposures_are_missing():
 
 
 def test_lookup_table_returns(tmp_path):
-    """Every float32 to the last bit; -1 is a pixel without support."""
+    """Every float32 is the same to the last bit; -1 is a pixel without support."""
     maps = np.random.default_rng(1).uniform(-3, 70, (2, 48, 64)).astype(np.float32)
     maps[:, 3, 5] = np.nan
     registry.write(tmp_path, 'lut', Content(lookups={'a': maps}), FileSettings())
@@ -1116,7 +1116,7 @@ def test_lookup_table_returns(tmp_path):
 
 
 def test_pipe_is_refused(tmp_path):
-    """Reading it would never end."""
+    """Reading a pipe would never end."""
     for name in ('points.csv', 'points.pho', 'points.dat'):
         os.mkfifo(tmp_path / name)
         assert 'this is a pipe, device or socket' in refused(tmp_path / name)
@@ -1128,7 +1128,7 @@ def test_pipe_is_refused(tmp_path):
 @pytest.mark.parametrize('separator', [None, ' ', ','])
 def test_table_without_rows_is_refused(text, separator):
     if separator == ' ' and text.strip():
-        return  # there these are words
+        return  # with spaces these are words
     with pytest.raises(DataError, match='no rows'):
         table_of('x.csv', text, separator)
 
@@ -1152,7 +1152,7 @@ def test_separator_of_a_table_is_that_of_its_first_row(text, separator, cells):
     'kind', registry.kinds(lambda f: f.write and f.kind not in ('c3d', 'lut'))
 )
 def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
-    """Truncated, with rows left out or doubled, or with other bytes: no other exception."""
+    """They are truncated, or have missing, doubled or changed parts; only DataError is raised."""
     matrix = np.array([[4000.0, 0, 500], [0, 4000, 380], [0, 0, 1]])
     camera = Camera('cam1', matrix, SIZE, np.eye(3), np.zeros(3))
     bodies = Bodies(('f',), np.array([1]), np.eye(3)[None, None], np.ones((1, 1, 3)), 50.0)
@@ -1171,7 +1171,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
     rng = np.random.default_rng(7)
     for path in map(pathlib.Path, written.paths):
         whole = path.read_bytes()
-        for _ in range(1 if kind == 'sleap' else 8):  # which is read by a program
+        for _ in range(1 if kind == 'sleap' else 8):  # reading sleap starts a program
             for damaged in _damaged(whole, rng):
                 path.write_bytes(damaged)
                 for as_kind in (None, kind):
@@ -1183,7 +1183,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
 
 
 def _damaged(whole, rng):
-    """The content of a file, damaged in three ways."""
+    """Yield the content of a file, damaged in three ways."""
     yield whole[: rng.integers(len(whole))]
     content = bytearray(whole)
     for _ in range(3):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recording without ROS: splits, latched topics, flushes, a slow and a full disk."""
+"""Recording without ROS: splits, latched topics, flushes, and a slow and a full disk."""
 
 import os
 import threading
@@ -75,7 +75,7 @@ def wait_until_written(recording, count):
 
 
 def test_open_chunk_is_on_disk_within_the_flush_period(tmp_path, monkeypatch):
-    """Without a further message, and with fsync."""
+    """It is flushed without a further message, and with fsync."""
     synced = threading.Event()
     real = os.fsync
 
@@ -94,7 +94,7 @@ def test_open_chunk_is_on_disk_within_the_flush_period(tmp_path, monkeypatch):
 
 
 def stopped_disk(monkeypatch):
-    """Let nothing be written until the event that is returned is set."""
+    """Block all writing until the returned event is set."""
     go = threading.Event()
     real = writer_module.BagWriter.write
 
@@ -107,7 +107,7 @@ def stopped_disk(monkeypatch):
 
 
 def test_slow_disk_drops_and_counts(tmp_path, monkeypatch):
-    """What is in the bag and what was dropped are together what was given."""
+    """The messages in the bag and the dropped ones are together all messages."""
     go = stopped_disk(monkeypatch)
     recording = started(tmp_path / 'bag', queue_size=1.0)
     data = text('x' * 99_000)
@@ -121,7 +121,7 @@ def test_slow_disk_drops_and_counts(tmp_path, monkeypatch):
 
 
 def test_images_do_not_displace_frames(tmp_path, monkeypatch):
-    """Where the disk is too slow for images, the small messages still find a place."""
+    """If the disk is too slow for images, small messages still find space in the queue."""
     go = stopped_disk(monkeypatch)
     recording = started(tmp_path / 'bag', queue_size=1.0)
     recording.add_topic(topic('/image'))

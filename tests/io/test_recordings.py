@@ -25,7 +25,7 @@ def grey(count=3, shape=(6, 8), bits=8, seed=0):
 
 
 def packed(image):
-    """Pixels of 10 bits one behind the other, as one large number a row."""
+    """Return pixels of 10 bits without gaps, as one large number per row."""
     rows = []
     for row in image:
         number = 0
@@ -36,7 +36,7 @@ def packed(image):
 
 
 def cine(images, bits=8, rate=500, annotation=b'', **changes):
-    """A cine file; changes replace fields of its headers."""
+    """Return a cine file; `changes` replace fields of its headers."""
     count, height, width = images.shape
     pixels = [
         packed(i) if bits == 10 else i[::-1].astype('<u2' if bits == 16 else 'u1').tobytes()
@@ -238,12 +238,12 @@ def test_image_without_ending_is_recognised_by_its_content(tmp_path, suffix):
     cv2.imwrite(str(tmp_path / f'image{suffix}'), image)
     path = (tmp_path / f'image{suffix}').rename(tmp_path / 'image')
     assert image_suffix_of(path) == suffix
-    np.testing.assert_allclose(images_of(path)[0], image, atol=1)  # JPEG
+    np.testing.assert_allclose(images_of(path)[0], image, atol=1)  # JPEG is lossy
 
 
 @pytest.mark.parametrize('name', ['notes', 'notes.txt', 'points.csv', 'DICOMDIR', 'folder'])
 def test_other_files_are_no_images(tmp_path, name):
-    """Neither text, nor the list of the files of a DICOM medium, nor what says it is another."""
+    """Text, the file list of a DICOM medium, and a file whose suffix denies it are no images."""
     (tmp_path / 'folder').mkdir()
     if name != 'folder':
         content = bytes(128) + b'DICM' if name == 'DICOMDIR' else b'P6 is not read'

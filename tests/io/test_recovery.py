@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Damaged and cut-off bags: all that is intact is recovered, and what is gone is said."""
+"""Damaged and truncated bags: intact content is recovered, and losses are reported."""
 
 import json
 import random
@@ -44,20 +44,20 @@ def frames():
 
 @pytest.fixture(scope='module', params=[CompressionType.ZSTD, CompressionType.NONE])
 def bag(request, tmp_path_factory, frames):
-    """A bag of some ten chunks."""
+    """A bag of about ten chunks."""
     path = tmp_path_factory.mktemp('bags') / 'bag'
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(writer_module, 'CHUNK_SIZE', 4000)
         patch.setattr(writer_module, 'CompressionType', SimpleNamespace(ZSTD=request.param))
         with BagWriter(path) as out:
             for pair in zip(*frames.values()):
-                for number, frame in enumerate(pair):  # a time of its own for every message
+                for number, frame in enumerate(pair):  # give every message a time of its own
                     out.write_frame(frame, log_time_ns=frame.stamp_ns + number)
     return path
 
 
 def chunks_of(path):
-    """[(first byte, byte behind, [message, ...])] of every chunk, from the index of the file."""
+    """Return [(first byte, end, [message, ...])] of every chunk, from the index of the file."""
     out = []
     with path.open('rb') as file:
         messages = list(make_reader(file).iter_messages())
@@ -78,7 +78,7 @@ def held(path):
 
 
 def test_chunk_that_claims_more_than_a_chunk_has_is_not_decompressed():
-    """By its frame, whatever the chunk says; and by the chunk, where the frame says nothing."""
+    """The size is taken from the frame, whatever the chunk says, or else from the chunk."""
     content = b'observations' * 100
     known = zstandard.ZstdCompressor().compress(content)
     unknown = zstandard.ZstdCompressor(write_content_size=False).compress(content)
@@ -86,7 +86,7 @@ def test_chunk_that_claims_more_than_a_chunk_has_is_not_decompressed():
     assert _decompressed(b'zstd', memoryview(unknown), len(content)) == content
     for size in (0, MAX_CHUNK + 1):
         assert _decompressed(b'zstd', memoryview(unknown), size) is None
-    # RFC 8878, 3.1.1.1: magic number, a descriptor with eight bytes of size, a terabyte
+    # RFC 8878, 3.1.1.1: magic number, a descriptor with eight bytes of size, a terabyte.
     claimed = known[:4] + bytes([0b11100000]) + (2**40).to_bytes(8, 'little') + known[6:]
     assert zstandard.frame_content_size(claimed) == 2**40
     assert _decompressed(b'zstd', memoryview(claimed), len(content)) is None
@@ -134,13 +134,13 @@ def test_bag_cut_off_anywhere_gives_the_complete_chunks(tmp_path, bag):
 
 
 def test_flipped_bit_costs_one_chunk_at_most(tmp_path, bag):
-    """Wherever it is: in a chunk, its length, an index, the summary or the ends of the file."""
+    """The bit may be in a chunk, its length, an index, the summary or the ends of the file."""
     content = (bag / 'bag_0.mcap').read_bytes()
     chunks = chunks_of(bag / 'bag_0.mcap')
     complete = held(bag)
     rng = random.Random(2)
     flipped = tmp_path / 'flipped.mcap'
-    # Some into the heads of chunks, which are few bytes but decide over much.
+    # Some bits are in the heads of chunks, which are few bytes with a large effect.
     places = [rng.randrange(len(content)) for _ in range(30)]
     places += [rng.choice(chunks)[0] + rng.randrange(50) for _ in range(20)]
     for number, place in enumerate(places):
@@ -165,7 +165,7 @@ def test_flipped_bit_costs_one_chunk_at_most(tmp_path, bag):
 
 
 def test_recovered_bag_is_a_bag_for_others(tmp_path, bag, frames):
-    """Same topics, definitions and QoS; with metadata.yaml, index and statistics."""
+    """Topics, definitions and QoS agree; it has metadata.yaml, an index and statistics."""
     folder = tmp_path / 'cut'
     shutil.copytree(bag, folder)
     content = (folder / 'bag_0.mcap').read_bytes()
@@ -178,7 +178,7 @@ def test_recovered_bag_is_a_bag_for_others(tmp_path, bag, frames):
             assert (a.topic, a.msgtype, a.digest, a.ext) == (b.topic, b.msgtype, b.digest, b.ext)
         count = one.message_count
     assert count == sum(recovery.counts.values()) > 0
-    # metadata.yaml of the cut-off bag says how many there were.
+    # metadata.yaml of the truncated bag has the original numbers.
     assert sum(recovery.lost.values()) == sum(len(f) for f in frames.values()) - count
     with (tmp_path / 'out' / 'out_0.mcap').open('rb') as file:
         kinds = {
@@ -207,7 +207,7 @@ def test_split_bag_with_a_lost_file(tmp_path, frames):
 
 
 def test_types_that_are_not_known_are_recovered_with_their_definition(tmp_path, frames):
-    """A lab's own messages: definition and hash come from the bag."""
+    """For a lab's own messages, definition and hash come from the bag."""
     from fluoro_calib_ros.io.bags.metadata import Definition
 
     with BagWriter(tmp_path / 'bag') as bag:
@@ -239,7 +239,7 @@ def test_command_says_what_is_gone(tmp_path, bag, capsys):
 
 
 def test_information_about_a_bag(tmp_path, frames, capsys):
-    """A dropped frame, a pair without partner, a pause, a clock that jumps back, a cut."""
+    """A dropped frame, a frame without partner, a pause, a clock that jumps back, a truncation."""
     recorded = [f for pair in zip(frames['a'], frames['b']) for f in pair]
     del recorded[10]
     path = tmp_path / 'bag'

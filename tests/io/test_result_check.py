@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A result folder whose files do not belong together says so."""
+"""A result folder with files that do not belong together is reported."""
 
 import json
 import shutil
@@ -35,7 +35,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def exchange(folder):
-    """Put the calibration of another run with the same exposures into the folder."""
+    """Replace the calibration by that of another run with the same exposures."""
     other = folder.parent / 'other'
     save_result(other, calibrated('a', 6, model='none'))
     shutil.copy(other / 'a.calibration.npz', folder)
@@ -97,7 +97,7 @@ def test_an_edited_result_is_named(folder, capsys):
 
 @pytest.fixture
 def judged(folder):
-    """The folder with a verdict."""
+    """Write a verdict into the folder."""
     checks = (Check(Kind.HALVES, 'halves', value=3.0, limit=2.0),)
     ids = {'a': load_calibrations(folder)['a'].calibration_id}
     write_validation(folder, Validation('fail', checks, ids, 0.0))

@@ -25,7 +25,7 @@ def calibrated():
 
 
 def rows_of(path):
-    """Rows of a CSV file as dicts."""
+    """Return the rows of a CSV file as dicts."""
     with path.open() as file:
         return list(csv.DictReader(file))
 

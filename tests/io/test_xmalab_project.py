@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""XMALab projects, built as ProjectFileIO of XMALab 2.2.7 writes them."""
+"""XMALab projects, written like those of ProjectFileIO of XMALab 2.2.7."""
 
 import zipfile
 
@@ -26,7 +26,7 @@ def table(rows, separator=', '):
 
 
 def calibration_points(camera, image):
-    """Pixels of the beads, those that the detection found, and whether XMALab uses them."""
+    """Return pixels of the beads and flags: whether XMALab found and uses them."""
     uv = np.random.default_rng(10 * camera + image).uniform(5, 250, (len(BEADS), 2))
     inlier = np.array([1, 1, 0, 1, -1])  # 0: switched off by the user, -1: not found
     uv[4] = -1
@@ -44,7 +44,7 @@ def image_bytes():
 
 
 def camera_xml(camera, separator, files):
-    """A camera element with two images, of which the second is calibrated, and a grid."""
+    """Return a camera element with a grid and two images, the second of which is calibrated."""
     folder = f'cam {camera}'
     data = f'{folder}{separator}data{separator}'
     files[f'{folder}/data/cam_CameraMatrix.csv'] = table([[900, 0, 150], [0, 905, 120], [0, 0, 1]])
@@ -88,7 +88,7 @@ def camera_xml(camera, separator, files):
 
 
 def write_project(path, separator='/', **changes):
-    """Write a project; changes replace files of the archive, None leaves one out."""
+    """Write a project; `changes` replace files of the archive, or omit them if None."""
     files = {}
     cameras = ''.join(camera_xml(camera, separator, files) for camera in (1, 2))
     files['CalibrationObject/cube.csv'] = 'x y z\n' + ''.join(
@@ -120,7 +120,7 @@ def write_project(path, separator='/', **changes):
 
 @pytest.mark.parametrize('separator', ['/', '\\'])
 def test_calibration_of_a_project_is_read(tmp_path, separator):
-    """Points of the observed image that XMALab used; also of a project from Windows."""
+    """It has the image points that XMALab used; projects from Windows are read, too."""
     content = registry.read(write_project(tmp_path / 'p.xma', separator), FileSettings(units='mm'))
     assert list(content.observations) == ['cam_1', 'cam_2']
     for camera in (1, 2):
@@ -137,7 +137,7 @@ def test_calibration_of_a_project_is_read(tmp_path, separator):
 
 
 def test_cameras_of_a_project_are_those_of_the_reference_image(tmp_path):
-    """In cm, the unit of frame specifications, with a note that says so."""
+    """They are in cm, the unit of frame specifications, with a note that says so."""
     content = registry.read(write_project(tmp_path / 'p.xma'), FileSettings())
     for number, camera in enumerate(content.cameras, 1):
         assert camera.name == f'cam_{number}' and camera.image_size == SIZE
@@ -148,7 +148,7 @@ def test_cameras_of_a_project_are_those_of_the_reference_image(tmp_path):
 
 
 def test_markers_of_a_trial_are_read(tmp_path):
-    """A marker is seen where its status is above 0; one without description is marker001."""
+    """A marker is seen if its status is above 0; one without description is named marker001."""
     path = write_project(tmp_path / 'p.xma')
     content = registry.read(path, FileSettings(trial='walk', wanted=('observations',)))
     frames = content.observations['cam_2']

@@ -23,7 +23,7 @@ def test_shifts_beyond_the_noise_of_a_correction_are_told():
 
 
 def test_more_exposures_show_smaller_shifts():
-    # The noise of a correction from 50 image points of 0.02 px is 0.0183 px, from 800 0.0046 px.
+    # The noise of a correction from image points of 0.02 px: 0.0183 px for 50, 0.0046 px for 800.
     assert bent_shadows('a', [image(0.03)]) is None
     assert bent_shadows('a', [image(0.034)]) is not None
     assert bent_shadows('a', [image(0.008)] * 16) is None

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Conversion of small sources whose content is known: what is kept, corrected, and left out."""
+"""Conversion of small sources with known content: what is kept, corrected, and omitted."""
 
 import functools
 import json
@@ -31,17 +31,17 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion
 
 SIZE = (320, 240)
 TURN = [0.5, 0.5, -0.5, 0.5]  # quaternion w, x, y, z of a third of a full turn
-PLACES = {3: [10.0, 20, -900], 7: [-5.0, 0, -800]}  # of the source of a, by exposure
+PLACES = {3: [10.0, 20, -900], 7: [-5.0, 0, -800]}  # position [mm] of the source of a, by exposure
 
 
 @functools.cache
 def calibration(name):
-    """A fluoroscope with a distortion of some pixels."""
+    """A fluoroscope with a distortion of a few pixels."""
     return rigs.smooth_pincushion(name, SIZE)
 
 
 def frames(angle=None):
-    """Three exposures of two fluoroscopes."""
+    """Three exposures of each of two fluoroscopes."""
     rng = np.random.default_rng(1)
     ids = np.arange(12) + 1
     return {
@@ -62,7 +62,7 @@ def table(tmp_path):
 
 @pytest.fixture
 def result(tmp_path):
-    """A result folder of a and b with exterior orientations, and the observations of a."""
+    """A result folder of a and b with exterior orientations, for which a has observations."""
     folder = tmp_path / 'result'
     for name in 'ab':
         save_calibration(folder, calibration(name))
@@ -116,7 +116,7 @@ def test_only_the_fluoroscopes_that_are_asked_for_are_written(table, tmp_path):
 
 
 def test_corrected_points_are_those_of_the_calibration(table, result, tmp_path):
-    """Its image size holds for the table; sigma grows by that of the correction."""
+    """The image size is taken from the calibration; sigma grows by that of the correction."""
     out = tmp_path / 'corrected.csv'
     given = request(table, 'observations', out, None, calibration=result, corrected=True)
     assert convert(given).notes == ()
@@ -164,7 +164,7 @@ def test_folders_are_told_apart_by_their_files(result, tmp_path):
     write_bag(bag, frames())
     assert not is_result_folder(bag) and is_bag(bag)
     (bag / 'metadata.yaml').unlink()
-    assert is_bag(bag)  # its files are enough
+    assert is_bag(bag)  # the mcap file is enough
     file = next(bag.iterdir())
     assert not is_result_folder(file) and is_bag(file)
     (tmp_path / 'empty').mkdir()
@@ -216,7 +216,7 @@ def test_cameras_of_a_result_stand_as_in_an_exposure_or_in_the_rig(result):
 
 
 def test_poses_of_the_phantom_are_in_the_order_of_the_exposures(result):
-    """In the optical frame of the first fluoroscope, or with an orientation in that of the rig."""
+    """They refer to the optical frame of the first fluoroscope or, if oriented, to the rig."""
     turn = matrix_from_quaternion(np.array(TURN))
     bodies = content(result, 'bodies').bodies
     assert bodies.frame.tolist() == [3, 7]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A rig that changes while it is recorded: it does not pass, and the command says why."""
+"""A rig that changes while it is recorded does not pass, and the command says why."""
 
 from argparse import Namespace
 from dataclasses import replace
@@ -23,7 +23,7 @@ RIG = SimpleNamespace(orientation=SimpleNamespace(fluoroscopes=('a', 'b')), bodi
 
 
 def outcome(*changes):
-    """Outcome without a healed rig; the second half of what was kept back tells of changes."""
+    """Return an outcome without a healed rig; the second unused half shows the changes."""
     checks = [
         healing._unused(SimpleNamespace(changes=(), complete=True), 1, RIG),
         healing._unused(SimpleNamespace(changes=changes, complete=True), 2, RIG),
@@ -58,7 +58,7 @@ def test_bodies_that_have_changed_are_left_out_while_another_one_remains():
 
 
 def test_unused_exposures_of_soft_bodies_alone_are_still_diagnosed():
-    """Else nothing would be left to tell that the rig, not all the bodies, has changed."""
+    """Otherwise nothing would be left to show that the rig, not all of the bodies, has changed."""
     assert not healing._left_out(SOFT, TARGET_ID).any()
     loose = Change(Cause.LOOSE, body=1, markers=(0,))  # two of three markers give no pose
     assert not healing._left_out([SOFT[0], loose], TARGET_ID).any()
@@ -130,7 +130,7 @@ def test_distortion_that_a_model_cannot_take_is_diagnosed_and_does_not_pass():
 
 
 def test_recording_that_three_changes_do_not_explain_does_not_pass():
-    """A rig that creeps looks like a distortion and bodies that are soft."""
+    """A rig that creeps looks like a distortion together with soft bodies."""
     changes = [Change(Cause.DISTORTION, fluoroscope=0), *SOFT]
     bodies = [Body(name, np.arange(4), np.eye(4, 3), np.ones(4)) for name in ('one', 'other')]
     rig = SimpleNamespace(orientation=RIG.orientation, bodies=bodies)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Shapes that a healthy rig learns: as they are, and not where something is wrong."""
+"""Shapes that a healthy rig learns: correct ones, and none where something is wrong."""
 
 import json
 from dataclasses import replace
@@ -54,7 +54,7 @@ def healthy():
 
 
 def moving(frames, marker, px=6.0):
-    """Frames of a body whose marker moves against the others, seen by both."""
+    """Return frames in which one marker moves relative to the others, in both views."""
     rng = np.random.default_rng(3)
     shift = rng.normal(0, px, (len(frames['a']), 2))
     return {
@@ -91,7 +91,7 @@ def test_body_with_a_loose_marker_is_left_out(healthy):
 
 
 def test_soft_body_is_left_out(healthy):
-    """Its markers move by less than ISO 16087 allows, and more than their deviations."""
+    """Its markers move by less than ISO 16087 allows, but more than their standard deviations."""
     rng = np.random.default_rng(4)
 
     def soft(body):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Processes of their own: results, errors, progress, cancellation and end."""
+"""Work in other processes: results, errors, progress, cancellation and termination."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from fluoro_calib_ros.processes import ProcessEnded, Resources, WorkerProcess, r
 
 
 class OwnError(Exception):
-    """An error that cannot be read back from its pickle."""
+    """An error that cannot be unpickled."""
 
     def __init__(self, one: int, other: int) -> None:
         super().__init__(f'{one} and {other}')
 
 
 class Work:
-    """A function with a memory, which does what it is told."""
+    """A callable that counts its calls and does what its argument says."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -73,7 +73,7 @@ def test_errors_of_users_arrive_as_they_are_and_others_are_named(process):
     assert 'ZeroDivisionError' in str(failed.value.__cause__)
     with pytest.raises(RuntimeError, match=r'the process of the work failed: .*1 and 2'):
         process('own')
-    assert process('count') == 5  # the same process, with its memory
+    assert process('count') == 5  # the same process, which has counted the earlier calls
 
 
 def test_progress_is_called_here_in_order(process):
@@ -96,7 +96,7 @@ def test_an_exception_of_the_caller_ends_the_process(process, when):
         with pytest.raises(InterruptedError):
             process('rounds', progress=cancel)
     assert not multiprocessing.active_children()
-    assert process('count') == 1  # in a new one
+    assert process('count') == 1  # a new process, which starts to count anew
 
 
 def test_a_process_that_ends_is_told_and_replaced(process):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Workers: the same results on a Dask cluster where one dies; none outlives its caller."""
+"""Workers: results do not change if a worker of a Dask cluster dies; none outlives its caller."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def cluster():
 
 
 class Killer:
-    """Progress that kills a worker of a cluster after the second file."""
+    """Progress callback that kills a worker of a cluster after the second file."""
 
     def __init__(self, cluster) -> None:
         self.cluster = cluster
@@ -96,7 +96,7 @@ def test_a_killed_worker_of_a_cluster_loses_no_image(images, cluster):
 
 @pytest.mark.long
 def test_a_killed_worker_of_a_cluster_loses_no_corrected_image(images, cluster, tmp_path):
-    """The files are the same bytes; the damaged one is named with the place that looked."""
+    """The files are the same bytes; the damaged one is named with the place that read it."""
     calibration = rigs.pincushion('a', (SIZE, SIZE))
     outs = [tmp_path / 'here', tmp_path / 'cluster']
     settings = {'keep_going': True, 'workers': 1}
@@ -122,7 +122,7 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
 
 
 def test_a_client_that_could_not_connect_is_closed_at_once(monkeypatch):
-    """Closed by the collector, later, it may hang with the start of another one."""
+    """If only the garbage collector closes it, it may hang with the start of another client."""
     from distributed import Client
 
     monkeypatch.setattr(scheduling, 'CONNECT_S', 0.5)
@@ -179,10 +179,10 @@ def test_who_has_no_certificate_of_the_cluster_gets_and_gives_nothing(tmp_path, 
         known = cluster_with(tmp_path, address, 'ca', 'lab')
         with open_workers(scheduler=known) as workers:
             assert list(workers.map(abs, [-1, -2])) == [1, 2]
-        monkeypatch.setattr(scheduling, 'CONNECT_S', 3)  # of those that never get in
+        monkeypatch.setattr(scheduling, 'CONNECT_S', 3)  # [s], short for connections that fail
         with pytest.raises(DataError, match='no Dask scheduler'):
             open_workers(scheduler=cluster_with(tmp_path, address, 'other', 'evil'))
-        with pytest.raises(DataError, match='no Dask scheduler'):  # the own authority is needed
+        with pytest.raises(DataError, match='no Dask scheduler'):  # needs the same authority
             open_workers(scheduler=cluster_with(tmp_path, address, 'ca', 'evil'))
 
         async def join() -> None:
@@ -255,7 +255,7 @@ if __name__ == '__main__':
 @pytest.mark.long
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
 def test_workers_end_with_their_caller(tmp_path, number):
-    """Neither signal lets the caller end them."""
+    """The caller cannot end them after either of these signals."""
     script = tmp_path / 'caller.py'
     script.write_text(CALLER.format(root=str(Path(__file__).parents[2])))
     with subprocess.Popen(
@@ -263,6 +263,6 @@ def test_workers_end_with_their_caller(tmp_path, number):
     ) as caller:
         workers = [os.pidfd_open(int(caller.stdout.readline())) for _ in range(2)]
         caller.send_signal(number)
-        for worker in workers:  # readable once it has ended
+        for worker in workers:  # the descriptor becomes readable when the worker has ended
             assert wait([worker], 30)
             os.close(worker)

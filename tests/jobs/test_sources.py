@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a path is, for each job that reads a source: what it accepts, and how it refuses."""
+"""What a path is, for each job that reads a source: what the job accepts and how it refuses."""
 
 import shutil
 from pathlib import Path
@@ -24,7 +24,7 @@ from fluoro_calib_ros.jobs.sources import read_source
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 GREY = np.full((40, 60), 90, np.uint8)
-READ = ''  # what is said of a source that is read
+READ = ''  # stands for a source that is read
 NO_BAG = 'this folder is not a bag'
 NO_MISSING_BAG = 'there is no such bag'
 NO_CAMERAS = 'the folder has no file of cameras'
@@ -34,7 +34,7 @@ UNKNOWN = 'the format is not known'
 NO_TOPIC = 'the bag has no topic of type'
 CUT = 'the bag is cut off'
 
-# By source: what is said of it as a source of image points, of a conversion and of images.
+# By source: the messages when it is read as image points, converted, and read as images.
 SAID = {
     'images': (NO_BAG, NO_CAMERAS, READ),
     'images/1.png': (UNKNOWN, UNKNOWN, READ),
@@ -51,7 +51,7 @@ SAID = {
     'radiographs/radiographs_0.mcap': (NO_TOPIC, NO_TOPIC, READ),
     'radiographs_without_metadata': (NO_TOPIC, NO_TOPIC, READ),
     'both': (READ, READ, READ),
-    'result': (NO_BAG, READ, NO_IMAGES),  # converted in test_conversion.py
+    'result': (NO_BAG, READ, NO_IMAGES),  # its conversion is tested in test_conversion.py
     'result/a.calibration.npz': (UNKNOWN, UNKNOWN, NO_ENDING),
     'points.csv': (READ, READ, NO_ENDING),
     'points': (READ, READ, NO_ENDING),
@@ -64,7 +64,7 @@ SAID = {
     'missing.mcap': (NO_MISSING_BAG, NO_MISSING_BAG, NO_MISSING_BAG),
     'missing.csv': ('there is no such file', 'there is no such file', NO_ENDING),
 }
-# Sources whose beads a calibration extracts.
+# Sources from which a calibration extracts beads.
 EXTRACTED = (
     *('images', 'images/1.png', 'rig', 'dicom', 'dicom/IM0001', 'radiographs'),
     *('radiographs/radiographs_0.mcap', 'radiographs_without_metadata'),
@@ -74,7 +74,7 @@ BAG_NAMES = ('bag', 'cut', 'radiographs', 'both', 'missing')
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """All of these sources, but a result folder with a calibration that nothing reads."""
+    """All of these sources; the result folder has a calibration that cannot be read."""
     out = tmp_path_factory.mktemp('sources')
     for name in ('images', 'rig', 'rig/a', 'dicom', 'result', 'empty'):
         (out / name).mkdir()
@@ -93,7 +93,7 @@ def folder(tmp_path_factory):
 
 
 def _write_bags(out):
-    """Bags of observations, of images and of both, whole and not."""
+    """Write bags of observations, of images and of both, intact and damaged."""
     shutil.copytree(BAGS / 'calibration', out / 'bag')
     mcap = out / 'bag' / 'calibration_0.mcap'
     for name in ('bag_without_ending', 'bag.other'):
@@ -117,7 +117,7 @@ def _write_bags(out):
 
 
 def said(job):
-    """What a job says of a source that it refuses."""
+    """Return the message with which a job refuses a source, or READ."""
     try:
         job()
     except DataError as error:
@@ -141,7 +141,7 @@ def test_every_job_reads_a_source_or_says_why_not(folder, tmp_path, source):
         (points, said(lambda: read_source(path, image_size=size))),
         (images, said(lambda: first_image(path))),
     ]
-    if source != 'result':  # that one has no calibration which could be read
+    if source != 'result':  # its calibration cannot be read
         request = ConversionRequest(
             path, 'observations', tmp_path / 'out.csv', settings=FileSettings(image_size=size)
         )

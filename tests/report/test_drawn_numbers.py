@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What tables and figures of the report hold is what the data say, read from the axes."""
+"""Tables and figures of the report show the numbers of the data, as read from the axes."""
 
 from dataclasses import replace
 from types import SimpleNamespace as Fake
@@ -67,7 +67,7 @@ def axes():
 
 
 def some_residuals():
-    """Six image points of exposures 4 and 9, of which one is an outlier."""
+    """Six image points of exposures 4 and 9, one of them an outlier."""
     exposure = np.array([4, 4, 4, 9, 9, 9])
     before = np.array([[3.0, 4], [0, 2], [1, 1], [2, 0], [0, 0], [50, 60]])
     after = before / [[5], [2], [1], [2], [1], [1]]
@@ -84,7 +84,7 @@ def test_numbers_of_exposures_are_of_their_inliers():
 
 
 def test_residuals_are_observed_and_corrected_minus_computed():
-    """Of targets that were adjusted, in exposures that were used."""
+    """They exist for adjusted targets in used exposures only."""
     calibration = rigs.pincushion('a', (1024, 1024))
     frame = rigs.exposures(5)['a'][0]
     fluoroscope = rigs.rig().fluoroscopes[0]
@@ -130,7 +130,7 @@ def test_outliers_are_drawn_at_the_border_of_the_panel():
 
 
 def test_residuals_are_normalised_by_what_the_unknowns_absorb():
-    """Sigma and the root of the redundancy number; the scale is that after the calibration."""
+    """Divisors: sigma, the root of the redundancy number, and the scale after the calibration."""
     rng = np.random.default_rng(3)
     sigma, redundancy = rng.uniform(0.2, 2.0, 50), rng.uniform(0.1, 0.9, 50)
     before, after = rng.normal(size=(2, 50, 2)) * (sigma * np.sqrt(redundancy))[:, None]
@@ -156,7 +156,7 @@ def test_histogram_is_a_density_of_all_values():
     _plot_histogram(drawn, values, 5.0, 'after')
     x, y = drawn.patches[0].get_xy().T
     assert (x.min(), x.max()) == (-5, 5)
-    assert y.max() == pytest.approx(2 / 8 / 0.25)  # two of eight in a bar of 0.25
+    assert y.max() == pytest.approx(2 / 8 / 0.25)  # two of eight values in a bin of width 0.25
     assert drawn.patches[0].get_facecolor()[:3] == to_rgb(AFTER)
     _plot_histogram(drawn, values, 5.0, 'before')
     assert drawn.patches[1].get_facecolor()[:3] == to_rgb(BEFORE)
@@ -225,7 +225,7 @@ def test_map_of_residuals_has_arrows_of_inliers_and_crosses():
 def test_bars_of_exposures_are_rms_and_beads():
     figure = exposure_bars(some_residuals(), 'a')
     upper, lower = figure.axes
-    assert figure.get_figwidth() > figure.get_figheight()  # for many exposures
+    assert figure.get_figwidth() > figure.get_figheight()  # wide enough for many exposures
     assert [bar.get_height() for bar in upper.patches] == pytest.approx([np.sqrt(2 / 3), 0.5])
     assert [bar.get_height() for bar in lower.patches] == [3, 2]
     median = (np.sqrt(2 / 3) + 0.5) / 2
@@ -253,12 +253,12 @@ def test_shifts_of_beads_are_relative_to_their_sd():
     figure = bead_shifts(shift, np.array([0.1, 0.1, 0.3]))
     left, right = figure.axes
     assert figure.get_figwidth() > figure.get_figheight()
-    assert left.get_position().x1 < right.get_position().x0  # beside each other
+    assert left.get_position().x1 < right.get_position().x0  # side by side
     assert {text.get_text() for text in left.get_legend().get_texts()} == {'x', 'y', 'z'}
     assert max(step.get_xy()[:, 0].max() for step in left.patches) == pytest.approx(0.9)
     counts = np.array([bar.get_height() for bar in right.patches])
     left_edges = np.array([bar.get_x() for bar in right.patches])
-    assert counts.sum() == 3 and counts[0] == 2  # 0.3 and 0.9 / 3 over the root of 3
+    assert counts.sum() == 3 and counts[0] == 2  # 0.3 / 0.1 and 0.9 / 0.3, over the root of 3
     assert left_edges[0] == pytest.approx(np.sqrt(3)) and counts[-1] == 1
 
 
@@ -277,7 +277,7 @@ def test_parts_of_the_image_without_beads_are_named():
 
 @pytest.mark.parametrize(('rows', 'missing'), [(3, 9), (4, 6)])
 def test_a_side_of_which_half_is_covered_is_not_missing(rows, missing):
-    """The upper third has ten rows of cells; a point covers the row below it, too."""
+    """The upper third has ten rows of cells; a point also covers the row below it."""
     width, height = np.array(SIZE) / 32
     u, v = np.meshgrid((np.arange(32) + 0.5) * width, (np.arange(rows) + 0.5) * height)
     uv = np.column_stack([u.ravel(), v.ravel()]) - 0.5
@@ -289,7 +289,7 @@ def test_figure_of_a_distortion_keeps_the_shape_of_the_image():
     model = rigs.pincushion('a', (640, 200)).model
     figure = distortion_figure(model, 'a', (640, 200), True, Scale(4.0, 0.5))
     width, height = figure.get_size_inches()
-    # Of each of the two panels, with a margin that is twice as high below the image.
+    # Each of the two panels has a margin, which is twice as high below the image.
     assert width == 15
     assert height == pytest.approx(2 + 5.3 * (200 + 3 * MARGIN * 640) / (640 + 2 * MARGIN * 640))
     left = figure.axes[0]
@@ -399,7 +399,7 @@ def test_arrows_of_a_comparison_are_as_long_as_their_cells():
     assert squares.get_array().tolist() == comparison().size.tolist()
     assert drawn.lines[0].get_xydata().tolist() == [[10.0, 20.0]]
     assert arrows.U.max() == pytest.approx(9) and arrows.V.max() == pytest.approx(12)
-    assert 'magnified 3 times' in drawn.get_title()  # 0.8 * 320 / 16 / 5 = 3.2
+    assert 'magnified 3 times' in drawn.get_title()  # 0.8 * 320 / 16 / 5 = 3.2, rounded down
 
 
 # ---- the rig in mm
@@ -418,7 +418,7 @@ def test_distances_of_the_phantom_are_along_the_axis():
 
 
 def test_beams_meet_at_their_angle():
-    """Sources are as far apart as they are, wherever the origin of the frame is."""
+    """The distances of the sources do not depend on the origin of the frame."""
     turned = [[0, 0, 1.0], [0, 1, 0], [-0.8, 0, 0.6]]
     orientation = Fake(
         fluoroscopes=('a', 'b', 'c'),
@@ -464,7 +464,7 @@ def test_drawing_of_a_rig_is_in_its_frame():
 
 
 def test_accuracy_in_space_is_of_distances_between_halves():
-    """Of four beads that are known, the first two against the last two."""
+    """Of four known beads, the first two are compared with the last two."""
     phantom = Phantom(np.arange(1, 6), np.diag([1.0, 2, 3, 4, 5])[:, :3] * 10, np.full(5, 0.3))
     covariance = np.tile(np.diag([0.04, 0.01, 0.09]), (6, 1, 1))
     points = Fake(
@@ -602,7 +602,7 @@ def frame(number, found, stamp_s):
 def test_figure_of_points_shows_when_each_was_found_and_its_sd():
     frames = [frame(n, [True, n != 2], 100 + 0.5 * n) for n in (1, 2, 3)]
     figure = points_figure(frames, {5: 'knee'})
-    assert figure.get_figwidth() > figure.get_figheight()  # paths, then when, then how well
+    assert figure.get_figwidth() > figure.get_figheight()  # paths, visibility, accuracy
     seen, known = figure.subfigs[1].axes
     labels = [label.get_text() for label in seen.get_yticklabels()]
     assert labels == ['knee: 100 %', '6: 67 %']
@@ -618,7 +618,7 @@ def test_figure_of_points_shows_when_each_was_found_and_its_sd():
 
 
 def test_points_are_in_the_path_of_their_target():
-    """Also where a frame has another first target."""
+    """A point is in the path of its target even if its frame has another first target."""
     every = [frame(n, [True, True, True], n) for n in (1, 2, 3)]
     late = every[1]
     late.target_id, late.points = late.target_id[1:], frame(2, [True, True], 2).points

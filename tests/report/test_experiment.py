@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The validation experiment at a small size, end to end, and its figures."""
+"""The validation experiment at a small size, end to end, with its figures."""
 
 import os
 import re
@@ -17,7 +17,7 @@ from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.simulation.rig import random_field
 
-sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
+sys.path.append(str(Path(__file__).resolve().parents[2]))  # the benchmarks are not installed
 from benchmarks import validation
 from benchmarks.experiment import (
     BEFORE,
@@ -59,14 +59,14 @@ def experiment(tmp_path_factory):
 
 
 def run_here(cases):
-    """Outcomes by case, in this process: those of a recording one after the other."""
+    """Return the outcomes by case, computed in this process recording by recording."""
     ordered = sorted(cases, key=lambda case: (case.scene, case.fluoroscopes))
     return {case: run_case(case) for case in ordered}
 
 
 def test_document_has_every_table_and_picture(experiment):
-    """Tables 1-9 with the paper's figures and ours, Figures 1-10, every other section; links lead
-    to pictures.
+    """The document has Tables 1-9 with the paper's figures and ours, Figures 1-10 and all other
+    sections; links lead to pictures.
     """
     plan, _, document = experiment
     text = document.read_text()
@@ -101,7 +101,7 @@ def test_document_has_every_table_and_picture(experiment):
 
 
 def test_pictures_are_whole_and_small(experiment):
-    """Every picture can be read, is no empty sheet, and all together stay small."""
+    """Every picture can be read and is not blank, and all together stay small."""
     folder = experiment[2].parent / 'images'
     names = sorted(os.listdir(folder))
     assert names == sorted(
@@ -116,7 +116,7 @@ def test_pictures_are_whole_and_small(experiment):
 
 
 def test_order_of_the_variants(experiment):
-    """Known distortion is not beaten, kNN is better than nothing, the default better than kNN."""
+    """No correction beats known distortion, kNN beats none, and the default beats kNN."""
     plan, outcomes, _ = experiment
     assert not [o.failed for o in outcomes.values() if o.failed]
     for system in ('a', 'b', 'a+b'):
@@ -136,7 +136,7 @@ def test_order_of_the_variants(experiment):
 
 
 def test_comparison_counts_from_known_distortion(experiment):
-    """Ratios are to known distortion of the same rig; curves show the outcomes of their counts."""
+    """Ratios refer to known distortion of the same rig; curves show the outcomes by count."""
     plan, outcomes, _ = experiment
     comparison = Comparison(plan, outcomes, plan.settings[0])
     assert comparison.ratios(KNOWN) == pytest.approx(1)
@@ -154,7 +154,7 @@ def test_comparison_counts_from_known_distortion(experiment):
 
 
 def test_failed_case_is_reported(experiment, tmp_path):
-    """A failed calibration leaves a dash in the tables, and its reason among the shortcomings."""
+    """A failed calibration gives a dash in the tables, and its reason among the shortcomings."""
     plan, outcomes, _ = experiment
     broken = dict(outcomes)
     for cases in (
@@ -190,7 +190,7 @@ def test_out_of_sample_test_equals_adjust_with_calibrations():
 
 
 def test_training_and_test_exposures_are_disjoint():
-    """Other counts are separate recordings."""
+    """A training set of another size is a separate recording."""
     case = Case(2, 'knn', **SMALL)
     scene = scene_of(*case.scene)
     frames, _ = scene.training(None, False)
@@ -206,13 +206,13 @@ def test_training_and_test_exposures_are_disjoint():
 
 
 def test_impossible_case_is_an_outcome_with_a_reason():
-    """Too few exposures: no numbers, but the reason."""
+    """Too few exposures give no numbers but a reason."""
     outcome = run_case(Case(2, 'knn', training=2, **SMALL))
     assert 'exposures' in outcome.failed and outcome.outside is None
 
 
 def test_projective_map_is_removed():
-    """A shift, scale, rotation and tilt leave nothing; a distortion keeps its size."""
+    """Shift, scale, rotation and tilt leave no residual; noise keeps its size."""
     rng = np.random.default_rng(0)
     ideal = rng.uniform(0, 1023, (400, 2))
     h = np.array([[1.01, 0.02, 5.0], [-0.02, 0.99, -7.0], [2e-5, -1e-5, 1.0]])
@@ -226,7 +226,7 @@ def test_projective_map_is_removed():
 
 
 def test_error_over_image_stays_in_the_calibrated_area():
-    """Without a correction the error is the distortion; beyond the image points it is NaN."""
+    """Without a correction the error is the distortion; outside the image points it is NaN."""
     field = random_field(np.random.default_rng(3))
     training = np.array([[200, 200], [800, 200], [800, 800], [200, 800.0]])
     errors = error_over_image(no_correction(), field, training, (1024, 1024))
@@ -238,7 +238,7 @@ def test_error_over_image_stays_in_the_calibrated_area():
 
 
 def test_residual_figures():
-    """The raw RMSE is that of the inliers; the reweighted RMSE and the cost are of all points with
+    """The raw RMSE is that of the inliers; the reweighted RMSE and the cost use all points with
     their weights.
     """
     residual = np.array([[1.0, 0], [-1, 2], [10, 10]])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the figures draw is what the model says."""
+"""Figures draw what the model predicts."""
 
 import numpy as np
 import pytest
@@ -103,14 +103,14 @@ def motion():
 
 
 def drawn(panel):
-    """Times and values of a panel, and limits of the band of the first two."""
+    """Return times and values of a panel, and the limits of the first band."""
     times, values = panel.lines[0].get_data()
     corners = panel.collections[0].get_paths()[0].get_extents()
     return times, values, (corners.y0, corners.y1)
 
 
 def test_poses_are_drawn_over_time_with_two_standard_deviations():
-    """Rotations from the first pose, in degrees; times without a marker are grey."""
+    """Rotations are relative to the first pose, in degrees; times without a marker are grey."""
     femur, tibia = motion()
     figure = body_figure(tibia)
     panels = figure.axes
@@ -152,7 +152,7 @@ def test_paths_of_bodies_have_axes_where_they_are():
     (space,) = figure.axes
     path = np.array(space.lines[1].get_data_3d())
     np.testing.assert_array_equal(path, tibia.position_mm.T)
-    length = 0.1 * 8 + 5  # by how far the tibia moves
+    length = 0.1 * 8 + 5  # a tenth of the distance that the tibia moves, plus 5
     ends = np.array([line.get_data_3d() for line in space.lines[-3:]])
     np.testing.assert_allclose(ends[:, :, 0], np.tile([18, 5, -7], (3, 1)))
     np.testing.assert_allclose(

@@ -35,7 +35,7 @@ MAX_BYTES = 5_000_000
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """Result folder of fluoroscope a, whose targets have names."""
+    """Result folder of fluoroscope a whose targets have names."""
     path = tmp_path_factory.mktemp('report') / 'result'
     names = Names({f'<bead> {i}': i for i in rig().phantom.target_id.tolist()})
     result = calibrated('a', 6, **OPTIONS)
@@ -48,18 +48,18 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def without_pictures(monkeypatch):
-    """Pictures are drawn, but not rendered."""
+    """Do not render pictures, but draw them."""
     monkeypatch.setattr(html_report, 'svg_text', lambda figure: '')
 
 
 @pytest.fixture
 def text_only(without_pictures, monkeypatch):
-    """Pictures of fluoroscopes are not drawn either."""
+    """Do not even draw the pictures of fluoroscopes."""
     monkeypatch.setattr(html_report, '_figures', lambda *_: [])
 
 
 class Page(html.parser.HTMLParser):
-    """Elements that are open, attributes that load something, and the text."""
+    """Collect the open elements, the attributes that load something, and the text."""
 
     def __init__(self):
         super().__init__()
@@ -104,7 +104,7 @@ def write_verdict(folder, verdict, sentence, **changes):
 
 @pytest.mark.long
 def test_report_needs_nothing_else(folder, capsys):
-    """One file below 5 MB; pictures inside, no address; names are text, never markup."""
+    """It is one file below 5 MB with pictures inside and no address; names are never markup."""
     assert run('report', folder) == 0
     path = folder / 'report.html'
     page, text = page_of(path)
@@ -159,7 +159,7 @@ def test_many_marks_are_pixels_and_few_are_vectors():
 
 
 def test_report_shows_the_residuals_of_the_adjustment(folder):
-    """They are computed again from the files; their RMS is that of the calibration."""
+    """They are recomputed from the files; their RMS is that of the calibration."""
     given = read_report_input(folder)
     residuals = html_report._residuals(given, 'a')
     entry = given.result['fluoroscopes']['a']
@@ -171,7 +171,7 @@ def test_report_shows_the_residuals_of_the_adjustment(folder):
 def test_standard_deviation_of_a_correction_is_that_at_the_angles_of_the_exposures(
     folder,
 ):
-    """Not the one of an unknown angle, which holds what the angle changes."""
+    """It is not that of an unknown angle, which includes the changes with the angle."""
     given = read_report_input(folder)
     turned = [replace(f, angle=0.1 * i) for i, f in enumerate(given.frames['a'])]
     given = replace(
@@ -244,7 +244,7 @@ def test_folder_without_calibration_is_refused(folder, tmp_path, text_only, caps
 
 
 def test_first_screen_is_in_mm(tmp_path, text_only):
-    """Points in space, distances, beams and fields of view, of a rig without distortion."""
+    """Points in space, distances, beams and fields of view, for a rig without distortion."""
     straight = virtual_rig(1, strength=0.0)
     frames = simulate_exposures(straight, 6, 1).frames
     request = CalibrationRequest(frames, straight.phantom, CalibrationOptions(model='none'))
@@ -331,7 +331,7 @@ def test_what_is_no_small_jpeg_is_refused(folder, tmp_path, content):
 
 
 def test_beads_are_compared_with_their_survey(folder, without_pictures):
-    """Their shift is the adjusted place minus the surveyed one, the largest first, by name."""
+    """A shift is the adjusted minus the surveyed place; the largest shifts come first, by name."""
     given = read_report_input(folder)
     beads = html_report._bead_picture(given)
     survey = dict(zip(given.phantom.target_id.tolist(), given.phantom.xyz_mm))
@@ -380,7 +380,7 @@ def test_sides_without_beads_are_named(folder):
 
 
 def test_exterior_orientations_have_the_names_of_their_exposures(folder):
-    """Whether the result holds their numbers as numbers or as texts."""
+    """The result may hold their numbers as numbers or as texts."""
     given = read_report_input(folder)
     entry = given.result['fluoroscopes']['a']
     listed = [e['exposure'] for e in entry['exposures']]
@@ -415,7 +415,7 @@ def test_panels_of_residuals_are_two_coordinates_by_three_scales():
         shown = (before, after, after)[column][:, row]
         np.testing.assert_array_equal(dots.get_ydata(), shown[good])
         np.testing.assert_array_equal(dots.get_xdata(), uv[good, row])
-        if column:  # beyond the panel: at its border
+        if column:  # points beyond the panel are drawn at its border
             assert crosses.get_ydata()[0] == pytest.approx(0.97 * limits[row, column])
         rmse = np.sqrt(np.mean(shown[good] ** 2))
         assert f'{rmse:.3f} px, 1 of 200' in axes.get_title()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report as PDF, by a browser that is found on the path: here a script in its place."""
+"""The report as PDF, printed by a browser found on the path, here replaced by a script."""
 
 import os
 import stat

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Figures and tables of a calibration: the files, and the numbers in them."""
+"""Figures and tables of a calibration: their files and the numbers in them."""
 
 import dataclasses
 import os
@@ -30,7 +30,7 @@ QUICK = {'model': 'local_linear', 'k': 30, 'max_iterations': 3}
 
 @pytest.fixture(scope='module')
 def scene():
-    """A phantom and six exposures of it by fluoroscope."""
+    """A phantom, and six exposures of it for each fluoroscope."""
     rig = virtual_rig(1)
     frames = simulate_exposures(rig, 6, 1).frames
     fewer = {
@@ -56,7 +56,7 @@ def plain(scene):
 
 @pytest.fixture
 def without_pixels(monkeypatch):
-    """Figures are drawn, but not rendered, which takes most of the time."""
+    """Do not render the figures, which takes most of the time."""
     monkeypatch.setattr(report_figures, 'png_bytes', lambda figure: b'pixels')
 
 
@@ -78,7 +78,7 @@ def test_figures_are_complete(job, tmp_path):
 
 @pytest.mark.long
 def test_figures_are_reproducible(plain, tmp_path, monkeypatch):
-    """The same result gives the same bytes, whatever matplotlib's settings, which stay."""
+    """The same result gives the same bytes for any settings of matplotlib, which do not change."""
     first = {path: Path(path).read_bytes() for path in write_figures(plain, tmp_path)}
     monkeypatch.setitem(matplotlib.rcParams, 'axes.facecolor', 'black')
     settings = {key: matplotlib.rcParams[key] for key in ('axes.facecolor', *STYLE)}
@@ -142,7 +142,7 @@ def test_folder_that_cannot_be_written(plain, tmp_path, without_pixels):
 
 
 def test_costs_and_normalised_residuals(job):
-    """Costs in percent of the adjustment without correction; residuals in units of the noise."""
+    """Costs are in percent of those without correction; residuals are in units of the noise."""
     run = job.runs['a']
     f, g, recorded = relative_costs(run)
     assert len(f) == len(run.history) + 1 and len(g) == len(recorded) == len(run.history)
@@ -157,7 +157,7 @@ def test_costs_and_normalised_residuals(job):
 
 
 def test_summary_holds_the_numbers(job):
-    """Each fluoroscope's figures are in its column, in pixels, and the text fits a terminal."""
+    """Figures of each fluoroscope are in its column, in pixels, and the text fits a terminal."""
     text = summary_table(job, {'p50': 0.1234, 'p99': 0.5, 'max': 2.25, 'frames': 480})
     line = {row[:36].strip(): row[36:].split() for row in text.splitlines()}
     a = job.fluoroscopes['a']

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The virtual knee: its files say the same as its motion, which is that of people."""
+"""The virtual knee: its files agree with its motion, and its motion with that of people."""
 
 import csv
 
@@ -27,11 +27,11 @@ from fluoro_calib_ros.simulation.knee import (
 )
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
-GRAVITY = 9810.0  # mm/s^2
+GRAVITY = 9810.0  # acceleration of gravity [mm/s^2]
 
 
 def markers_at(knee, motion):
-    """Markers (T, 8, 3) in the rig, of the femur and of the tibia [mm]."""
+    """Return the markers (T, 8, 3) [mm] of femur and tibia in the rig."""
     return np.concatenate(
         [
             np.einsum('tij,mj->tmi', motion.rotation[b.name], b.xyz_mm)
@@ -60,7 +60,7 @@ def exact_poses(body, rotation, position):
 
 
 def table(path, first):
-    """Columns of numbers of a CSV file by name, of the rows whose first cell is this."""
+    """Return the numeric columns of a CSV file by name, for rows whose first cell is `first`."""
     with path.open() as file:
         rows = list(csv.reader(file))
     values = np.array([row[1:] for row in rows[1:] if row[0] == first], dtype=float)
@@ -69,7 +69,7 @@ def table(path, first):
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """A data set as the command writes it."""
+    """A data set written by the command."""
     path = tmp_path_factory.mktemp('knee') / 'rig'
     flags = ['--bodies', '--seconds', '0.4', '--rate', '100', '--exposures', '1', '--seed', '3']
     main(['simulate', '--out', str(path), *flags])
@@ -85,7 +85,7 @@ def test_without_the_flag_there_is_no_knee(tmp_path):
 
 @pytest.mark.parametrize('name', MOTIONS)
 def test_the_files_belong_together(folder, name):
-    """Poses, joint and joint angles; bodies, poses and image points, through the written rig."""
+    """Poses agree with joint and angles; image points with bodies, poses and the written rig."""
     bodies = read_bodies(folder / 'bodies.csv')
     true = read_bodies(folder / 'truth' / 'bodies.csv')
     (entry,) = read_joints(folder / 'joints.toml', bodies)
@@ -126,7 +126,7 @@ def test_the_files_belong_together(folder, name):
 
 
 def test_walking_is_that_of_people():
-    """Flexion at initial contact, in stance and in swing, of Schwartz et al. (2008)."""
+    """Flexion at initial contact, in stance and in swing agrees with Schwartz et al. (2008)."""
     knee = virtual_knee(1)
     cycle = np.array([0, 0.12, 0.42, 0.6, 0.72, 0.96])
     flexion = np.rad2deg(walking(knee, cycle * CYCLE_S).angles[:, 0])
@@ -137,7 +137,7 @@ def test_walking_is_that_of_people():
 
 
 def test_landing_has_an_impact():
-    """Free fall, then tens of g within some milliseconds, without a jump of the velocity."""
+    """After free fall, tens of g act for a few milliseconds, but the velocity does not jump."""
     knee = virtual_knee(1)
     step = 1e-4
     times = np.arange(0, 0.4, step)
@@ -149,13 +149,13 @@ def test_landing_has_an_impact():
     contact = (middle > FALL_S) & (middle < FALL_S + 0.005)
     assert (acceleration[contact].max(axis=0) > 20).all()
     assert acceleration[middle > FALL_S + 0.03].max() < 5
-    assert np.linalg.norm(np.diff(velocity, axis=0), axis=2).max() < 30  # mm/s
+    assert np.linalg.norm(np.diff(velocity, axis=0), axis=2).max() < 30  # mm/s in a step
     assert np.linalg.norm(velocity[-1], axis=1).max() < 100
 
 
 @pytest.mark.parametrize('name', MOTIONS)
 def test_the_markers_are_seen(name):
-    """Both fluoroscopes see nearly all; the same seed gives the same recording."""
+    """Both fluoroscopes see nearly all markers; the same seed gives the same recording."""
     rig = virtual_rig(2)
     knee = virtual_knee(2)
     motion = MOTIONS[name](knee, np.arange(0, 0.4, 0.01))
@@ -170,7 +170,7 @@ def test_the_markers_are_seen(name):
 
 
 def test_what_goes_with_flexion_is_a_few_degrees_and_millimetres():
-    """Of an extended knee and one bent by 90 degrees: the drawer goes back by 6 mm."""
+    """Between an extended knee and one bent by 90 degrees, the drawer moves back by 6 mm."""
     angles, translations = _coupled(np.deg2rad([0.0, 90.0]), np.zeros(2))
     assert np.rad2deg(angles[:, 0]) == pytest.approx([0.0, 90.0])
     assert angles[1, 1:] - angles[0, 1:] == pytest.approx([-0.04, 0.1])

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Grey values of virtual radiographs: what beads, plates, bones and the detector do to the light.
+"""Grey values of virtual radiographs: effects of beads, plates, bones and the detector.
 
-Expected figures are paths in millimetres by elementary geometry, and Lambert and Beer's law.
+Expected values follow from path lengths in mm by elementary geometry and the Beer-Lambert law.
 """
 
 from dataclasses import replace
@@ -33,14 +33,14 @@ from fluoro_calib_ros.simulation.radiographs import (
 from fluoro_calib_ros.simulation.rig import CUBE_MM, virtual_rig
 
 SIZE = 64
-# Nothing but absorption.
+# Absorption only.
 IDEAL = RadiographSettings(blur_px=0.0, glare=0.0, focal_spot_mm=0.0, round_field=False)
 STILL = (np.eye(3), np.zeros(3))
 MIDDLE = (SIZE // 2, SIZE // 2)
 
 
 def fluoroscope():
-    """Straight down z from 1000 mm, small images, no distortion."""
+    """Return a fluoroscope that looks down z from 1000 mm; small images, no distortion."""
     turned = np.diag([1.0, -1.0, -1.0])
     return replace(
         virtual_rig(1, strength=0.0).fluoroscopes[0],
@@ -52,7 +52,7 @@ def fluoroscope():
 
 
 def transmission(points, settings=IDEAL, plates=False, diameter=None):
-    """Light over that of the open beam."""
+    """Return the transmitted light relative to the open beam."""
     taken = Radiography(fluoroscope(), settings)
     given = (np.reshape(points, (-1, 3)), STILL, 1)
     return taken.light(*given, diameter_mm=diameter, plates=plates) / taken.light(
@@ -61,7 +61,7 @@ def transmission(points, settings=IDEAL, plates=False, diameter=None):
 
 
 def test_a_bead_absorbs_along_its_diameter_where_it_is():
-    # 20 mm to the right are 5 px, and the source is above: y points up in the image.
+    # 20 mm to the right are 5 px. As the source is above, y points up in the image.
     diameter = np.array([40.0])
     settings = replace(IDEAL, bead_attenuation=0.02)
     found = transmission([[20.0, 40.0, 0.0]], settings, diameter=diameter)
@@ -82,11 +82,11 @@ def test_lengths_of_rays_inside_a_sphere():
 
 
 def test_plates_darken_what_they_cover():
-    """A ray down the axis passes between the side faces, one from the side through two of them."""
+    """A ray down the axis passes between the side faces, a ray from the side through two."""
     found = transmission(np.zeros((0, 3)), replace(IDEAL, plate_attenuation=0.01), plates=True)
     assert found.max() <= 1.0 + 1e-6
     inside = found[MIDDLE]
-    assert inside == pytest.approx(1.0, abs=1e-6)  # between the faces
+    assert inside == pytest.approx(1.0, abs=1e-6)  # the axis is between the faces
     thick = IDEAL.plate_mm
     from_side = replace(
         fluoroscope(),
@@ -99,7 +99,7 @@ def test_plates_darken_what_they_cover():
     empty = seen.light(np.zeros((0, 3)), STILL, plates=False)
     ratio = light / empty
     assert ratio[MIDDLE] == pytest.approx(np.exp(-0.01 * 2 * thick), rel=1e-3)
-    assert ratio[MIDDLE[0], 1] == pytest.approx(1.0, abs=1e-6)  # beside the cube
+    assert ratio[MIDDLE[0], 1] == pytest.approx(1.0, abs=1e-6)  # outside the cube
     assert ratio.min() > np.exp(-0.01 * CUBE_MM * 1.2)
 
 
@@ -122,7 +122,7 @@ def test_grey_values_of_dark_and_open_beam(bits, dtype, inverted):
 
 
 def test_more_light_than_the_range_is_the_largest_value():
-    """Noise of few photons exceeds it."""
+    """The noise of few photons exceeds the range."""
     settings = replace(IDEAL, photons=4.0, bits=8)
     image = Radiography(fluoroscope(), settings).image(np.zeros((0, 3)), STILL, 1, plates=False)
     assert image.max() == 255 and image.min() < 100
@@ -172,7 +172,7 @@ def test_the_field_is_open_inside_and_dark_outside(is_round):
     assert light.shape == (160, 200)
     assert light[80, 100] == pytest.approx(1.0, abs=0.02)
     assert light[80, 0] < 0.05 and light[0, 0] < 0.05
-    # Only a rectangle is open near its corners.
+    # Only a rectangular field is open near its corners.
     assert (light[12, 14] > 0.4) is not is_round
 
 
@@ -184,7 +184,7 @@ def test_clutter_only_absorbs():
 
 
 def test_a_bone_absorbs_along_its_wall():
-    """Between an ellipsoid and one of 0.78 of its size, along a ray through the middle."""
+    """It lies between an ellipsoid and one of 0.78 of its size; the ray is through the middle."""
     scene = MarkerScene(clusters=1)
     markers = MovingMarkers(scene, 1)
     settings = replace(MARKER_SETTINGS, clutter=0, focal_spot_mm=0.0)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The virtual rig: reproducible, with the documented geometry and a truth that agrees with the
+"""The virtual rig is reproducible and has the documented geometry; its truth agrees with the
 observations.
 """
 
@@ -44,7 +44,7 @@ def same_frames(one, other):
 
 
 def test_same_seed_gives_the_same_numbers():
-    """To the last bit; another seed gives another rig and other exposures."""
+    """They agree to the last bit; another seed gives another rig and other exposures."""
     one = virtual_rig(3)
     other = virtual_rig(3)
     third = virtual_rig(4)
@@ -70,8 +70,8 @@ def test_same_seed_gives_the_same_numbers():
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_the_sources_are_where_the_documentation_says(seed):
-    """About 1.5 m from the middle, about 2 m apart, looking at it, image upright (v down is z of
-    the rig down).
+    """They are about 1.5 m from the middle, which they look at, and 2 m apart. The image is
+    upright: v points down the z axis of the rig.
     """
     a, b = virtual_rig(seed).fluoroscopes
     assert (a.name, b.name) == ('a', 'b')
@@ -87,7 +87,7 @@ def test_the_sources_are_where_the_documentation_says(seed):
 
 
 def test_rigs_of_more_fluoroscopes():
-    """The default is unchanged; of three, neighbouring axes differ by the given angle."""
+    """The default is unchanged; with three, neighbouring axes differ by the given angle."""
     same = virtual_rig(3, between_deg=84.0).fluoroscopes
     for one, other in zip(virtual_rig(3).fluoroscopes, same):
         np.testing.assert_array_equal(one.rotation, other.rotation)
@@ -111,7 +111,7 @@ def test_looking_at_the_origin_puts_it_on_the_axis():
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_the_phantom_is_a_cube_of_503_beads_with_a_survey(seed):
-    """On its four side faces, without duplicates; the survey has its standard deviation."""
+    """Beads lie on its four side faces without duplicates; the survey has its deviation."""
     rig = virtual_rig(seed)
     assert rig.true_mm.shape == (BEADS, 3) == (503, 3)
     x, y, z = np.abs(rig.true_mm).T
@@ -139,8 +139,8 @@ def test_the_phantom_is_a_cube_of_503_beads_with_a_survey(seed):
 
 @pytest.mark.parametrize('seed', range(20))
 def test_distortion_is_large_at_the_edge_and_small_in_the_middle(seed):
-    """14 to 17 px along the edge, 26 to 35 px in the corners; smooth; scaled by its strength, down
-    to none.
+    """14 to 17 px along the edge and 26 to 35 px in the corners; smooth, and proportional to its
+    strength, down to none.
     """
     field = random_field(np.random.default_rng(seed))
     size = np.linalg.norm(field(GRID), axis=1)
@@ -188,7 +188,7 @@ def test_number_and_size_of_the_exposures():
 
 
 def errors_of_image_points(rig, simulated):
-    """Observed minus true image points (N, 2), from the truth of rig and poses."""
+    """Return observed minus true image points (N, 2), from the true rig and poses."""
     out = []
     for f in rig.fluoroscopes:
         for frame, (rotation, shift) in zip(simulated.frames[f.name], simulated.poses):
@@ -198,14 +198,14 @@ def errors_of_image_points(rig, simulated):
 
 
 def test_noise_and_false_matches_have_the_given_size():
-    """A false match is on another bead nearby; the rest is Gaussian noise."""
+    """A false match is at another bead nearby; all other errors are Gaussian noise."""
     rig = rigs.rig()
     for share, noise in ((0.01, 0.25), (0.2, 0.25), (0.0, 1.0)):
         error = errors_of_image_points(
             rig, simulate_exposures(rig, 10, 6, Detection(noise, share))
         )
         size = np.linalg.norm(error, axis=1)
-        false = size > 6 * noise  # beads of opposite faces may coincide even so
+        false = size > 6 * noise  # beads of opposite faces may coincide, even for false matches
         assert false.mean() == pytest.approx(share, abs=3 * np.sqrt(share / len(error)))
         assert np.sqrt(np.mean(error[~false] ** 2)) == pytest.approx(noise, rel=0.03)
         if share:
@@ -213,7 +213,7 @@ def test_noise_and_false_matches_have_the_given_size():
 
 
 def test_the_exterior_orientation_of_a_pose_gives_the_image_points():
-    """exterior(): relative to the phantom, as an adjustment reports it."""
+    """exterior() is relative to the phantom, as in the result of an adjustment."""
     rig = rigs.rig()
     simulated = simulate_exposures(rig, 4, 6)
     for f in rig.fluoroscopes:
@@ -254,8 +254,8 @@ def test_the_poses_turn_the_phantom_all_round():
 
 
 def test_tracking_shows_rigid_clusters_in_motion():
-    """Four clusters of six markers, visible throughout, with image points that belong to their
-    positions.
+    """Four rigid clusters of six markers are visible throughout; their image points agree with
+    their positions.
     """
     rig = rigs.rig()
     tracking = simulate_tracking(rig, 2.0, 60.0, seed=1)

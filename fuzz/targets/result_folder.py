@@ -26,7 +26,7 @@ from ..seeds import rig
 
 @functools.cache
 def _folder() -> tempfile.TemporaryDirectory[str]:
-    """Return the result folder of a small calibration; it lives as long as the process."""
+    """Return the result folder of a small calibration; it exists until the process ends."""
     temporary = tempfile.TemporaryDirectory()
     frames = {'a': simulate_exposures(rig(), 5, 1).frames['a']}
     options = CalibrationOptions(model='none', max_iterations=2)

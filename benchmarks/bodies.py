@@ -330,7 +330,7 @@ def errors(poses: BodyPoses, turn: Rotation, place: np.ndarray) -> tuple[np.ndar
 def compared(error: np.ndarray, poses: BodyPoses, turn: Rotation, place: np.ndarray) -> np.ndarray:
     """Return mean squares (2, 2) of position and rotation, of errors and of the best filters.
 
-    poses: poses of single exposures, the input of the Butterworth filters, whose cutoffs are chosen
+    poses: single-exposure poses, the input of the Butterworth filters. Their cutoffs are chosen
     using the truth. Both are compared in the exposures from the first to the last of these poses.
     """
     sd = poses.sd[:, :3].max(axis=1)

@@ -290,7 +290,7 @@ class Comparison:
         ]
 
     def by_rig(self) -> str:
-        """Return a table of ratios to known distortion by rig and model, and the default's choice."""
+        """Tabulate ratios to known distortion by rig and model, and the default's choice."""
         rows = []
         for s in self.plan.seeds:
             row = [str(s), '-' if self[KNOWN, s].failed else f'{self[KNOWN, s].points_mm():.4f}']

@@ -216,7 +216,7 @@ def _reconstruction(network: Network, start: Parameters, held: np.ndarray) -> An
             image, pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ position]))
         )
     first = np.searchsorted(network.exposure, np.arange(len(start.rotation)))
-    number = np.arange(len(network.uv)) - first[network.exposure]  # of the point in its image
+    number = np.arange(len(network.uv)) - first[network.exposure]  # index in its image
     xyz = np.where(held[:, None], network.survey_mm, start.points_mm)
     order = np.argsort(network.point, kind='stable')
     starts = np.searchsorted(network.point[order], np.arange(len(xyz) + 1))
@@ -268,9 +268,9 @@ def self_calibrate_with_peers(
     """Run the loop of Chow et al. with COLMAP's bundle adjuster and scikit-learn's grid search.
 
     The folds and the reconstruction, from which each adjustment continues, are built once. The
-    datum is defined by object points seen in fewer than three exposures, and every tenth point. Like
-    ours, the loop ends when the next round would change the correction by less than settled_px, or
-    after `rounds`.
+    datum is defined by object points seen in fewer than three exposures, and every tenth point.
+    Like ours, the loop ends when the next round would change the correction by less than
+    settled_px, or after `rounds`.
     """
     network, start = drop_rarely_seen_points(network, start, 2)
     held = (np.arange(len(network.survey_mm)) % 10 == 0) | (np.bincount(network.point) < 3)

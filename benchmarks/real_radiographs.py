@@ -201,7 +201,7 @@ class Tally:
 
 
 def centroid(image: np.ndarray, place: np.ndarray, radius: float) -> np.ndarray:
-    """Centroid (2,) of a dark shadow of an image (h, w) near a place (2,), NaN for none."""
+    """Return the centroid (2,) of a dark shadow of an image (h, w) near (2,), NaN for none."""
     reach = int(np.ceil(REACH[1] * radius))
     column, row = (int(value) for value in np.rint(place))
     height, width = image.shape

@@ -56,9 +56,9 @@ def errors_at_angles(scene, calibration, uv, grid, angles, free_field=None):
     """Return errors (n, 2) and stated sd (n,) of fluoroscope a at pixels grid (g, 2), all angles.
 
     uv: image points of the fit. The result has the key 'held', where the truth is in the gauge of
-    the mean correction over the exposures with a rotation of the sensor at each angle. If free_field
-    is given, a field without variance of a change of the interior orientation, the result also has
-    the key 'free': see `angle_claims`.
+    the mean correction over the exposures with a rotation of the sensor at each angle. If
+    free_field is given, a field without variance of a change of the interior orientation, the
+    result also has the key 'free': see `angle_claims`.
     """
     pixels = np.concatenate([uv, grid])
     camera = scene.cameras[0]

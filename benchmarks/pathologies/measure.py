@@ -33,7 +33,7 @@ class Truth:
 
 
 def resect(rays, points, rotation, source):
-    """Rotation and source that fit rays (n, 2) of points (n, 3) best, from approximate ones."""
+    """Refine rotation and source to fit rays (n, 2) of points (n, 3), from approximate values."""
     for _ in range(RESECTION_STEPS):
         x = (points - source) @ rotation.T
         inverse = 1 / x[:, 2]
@@ -53,7 +53,7 @@ def resect(rays, points, rotation, source):
 
 
 def intersect(rays, exteriors, points):
-    """Return points (n, 3) from the rays (n, 2) of two fluoroscopes, given initial values."""
+    """Refine points (n, 3) to fit the rays (n, 2) of two fluoroscopes, from approximate values."""
     for _ in range(INTERSECTION_STEPS):
         jacobian = []
         misclosure = []
@@ -73,8 +73,8 @@ def intersect(rays, exteriors, points):
 def out_of_sample(scene, corrected, seed):
     """Return RMS error [px] of noise-free test points; errors (n, 3) [mm] of noisy stereo points.
 
-    corrected(f, observed, angle) returns rays (n, 2), c and a mask (n,) of the points to use; angle
-    is that of the C-arm [rad].
+    corrected(f, observed, angle) returns rays (n, 2), c and a mask (n,) of the points to use;
+    angle is that of the C-arm [rad].
     """
     rng = np.random.default_rng([seed, 5])
     sd = scene.case.noise.sd
@@ -223,8 +223,9 @@ def test_angles(scene, calibration):
 def independent_errors(run, model):
     """Return the number of independent errors in the claimed covariance of a correction.
 
-    The covariance is that at the image points. An NSE of so many errors scatters as chi squared over
-    its degrees of freedom (Box 1954, Theorem 3.1). None if the adjustment does not estimate the model.
+    The covariance is that at the image points. An NSE of so many errors scatters as chi squared
+    over its degrees of freedom (Box 1954, Theorem 3.1). None if the adjustment does not estimate
+    the model.
     """
     network = run.measured.network
     additional = network.additional[0] if network.additional else None

@@ -46,7 +46,7 @@ def resident_mb(process: subprocess.Popen[Any]) -> float:
 
 
 def wait_for_orientation(reader: Reader) -> None:
-    """Wait until the reconstruction node has an orientation and all its corrected streams.
+    """Wait until the reconstruction node has an orientation and receives all corrected streams.
 
     Earlier exposures would give no points, and publication would stop after part of a queue.
     """

@@ -110,7 +110,7 @@ def object_table(
 
 
 def reprojection_table(outcomes: Mapping[str, Outcome], paper: Sequence[Sequence[float]]) -> str:
-    """Tables 1, 4, 7: cost and RMSE of the in-sample residuals."""
+    """Return Tables 1, 4, 7: cost and RMSE of the in-sample residuals."""
     header = [
         '',
         'cost',

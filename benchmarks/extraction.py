@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Extraction of beads from radiographs: found, precise, honest, never wrong.
+"""Extraction of beads from radiographs: completeness, precision, claimed sd and false ids.
 
     python -m benchmarks.extraction --images 100        all sets of images, printed as tables of
                                                         docs/how_good.md

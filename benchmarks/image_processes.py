@@ -105,7 +105,7 @@ class Camera(Node):
 
 
 class Relay(ManagedNode):
-    """Publishes every image of a/image_raw on a/relayed."""
+    """Republishes every image of a/image_raw on a/relayed."""
 
     def __init__(self) -> None:
         super().__init__('relay')

@@ -518,8 +518,8 @@ def _bone(rng: np.random.Generator) -> np.ndarray:
 def _skeleton(part: str, rng: np.random.Generator) -> np.ndarray:
     """Return path lengths (h, w) [mm] of rays in the bones of a hand or a spine.
 
-    Bones are ellipses with a dense border: four per finger and eight in the wrist, or vertebrae with
-    pedicles.
+    Bones are ellipses with a dense border: four per finger and eight in the wrist, or vertebrae
+    with pedicles.
     """
     bones = _hand(rng) if part == 'hand' else _spine(rng)
     turn = rng.uniform(0, 2 * np.pi)

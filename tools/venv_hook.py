@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Give every Python of the project's .venv the environment that ROS needs, with nothing sourced.
+"""Give every Python of the project's .venv the environment that ROS needs, without sourcing.
 
 tools/setup_env.py copies this file into the venv as fluoro_calib_venv.py, with a .pth file that
 imports it before anything else. The shared libraries of ROS are found only by LD_LIBRARY_PATH,

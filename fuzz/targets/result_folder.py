@@ -38,7 +38,7 @@ def _folder() -> tempfile.TemporaryDirectory[str]:
 def _read(path: Path) -> None:
     folder = Path(_folder().name) / 'result'
     (folder / RESULT).write_bytes(path.read_bytes())
-    with mock.patch.object(html, '_figures', lambda *_: []):  # seconds, from other files
+    with mock.patch.object(html, '_figures', lambda *_: []):  # slow, from other files
         both(lambda: list(stations_of(folder / RESULT)), lambda: write_report(folder))
 
 

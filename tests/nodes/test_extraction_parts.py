@@ -50,7 +50,7 @@ def test_a_full_queue_sheds_the_oldest_exposure_that_is_not_begun():
     assert lost == [[]] * 4
     assert next_of(queue, 'a') == ('a', 1)
     assert queue.put('a', 3, ('a', 3)) == []
-    assert queue.put('b', 3, ('b', 3)) == ['a', 'b']  # exposure 2: its partner has begun 1
+    assert queue.put('b', 3, ('b', 3)) == ['a', 'b']  # exposure 2, since 1 has begun
     assert queue.put('a', 2, ('a', 2)) == ['a']  # too late
     assert [next_of(queue, 'b'), next_of(queue, 'b'), next_of(queue, 'a')] == [
         ('b', 1),

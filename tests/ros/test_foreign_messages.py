@@ -28,7 +28,7 @@ def drift_observations(status):
 def test_camera_info_of_another_camera_does_not_restart_the_drift_watch(
     graph, by_command, tracking
 ):
-    """It is named, and the watch goes on with what it has seen."""
+    """The other camera is named, and the watch keeps its previous observations."""
     client = graph.client
     node = graph.whole_chain(by_command)['reconstruction_node']
     points = client.listen('reconstruction/points_with_covariance')

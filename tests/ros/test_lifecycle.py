@@ -60,7 +60,7 @@ def test_node_processes_frames_only_while_active(graph, by_command, tracking):
         client.wait_for_diagnostics(
             'correction_node', lambda s: 'the node is not active' in s.message
         )
-        client.publish(replace(frame, number=100 * turn + 1))  # to nobody
+        client.publish(replace(frame, number=100 * turn + 1))  # no subscriber
         assert change(client, 'correction_node', Transition.TRANSITION_ACTIVATE)
         assert state(client, 'correction_node') == State.PRIMARY_STATE_ACTIVE
         client.wait_until(
@@ -111,7 +111,7 @@ def test_paused_calibration_node_keeps_what_it_has(graph, exposures, tmp_path):
     assert client.status().exposures == 1
     assert set_parameter('collect', 'still').successful
     assert change(client, 'calibration_node', Transition.TRANSITION_DEACTIVATE)
-    publish(2)  # to nobody
+    publish(2)  # no subscriber
     assert client.wait_for_diagnostics(
         'calibration_node', lambda s: s.message == 'the node is not active'
     )

@@ -33,11 +33,11 @@ from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
-SEED = 1  # of the bags
+SEED = 1  # rig seed of the bags
 EXPOSURES = 60
 RATE_HZ = 120.0
 MOVED_MM = np.array([3.0, -2.0, 3.5])  # norm 5 mm
-TURNED_RAD = np.radians([0.35, -0.28, 0.22])  # 0.5 degrees
+TURNED_RAD = np.radians([0.35, -0.28, 0.22])  # norm 0.5 degrees
 COVARIANCE = [f'cov_{name}' for name in ('xx', 'xy', 'xz', 'yy', 'yz', 'zz')]
 FAULTS = ('accept_healing', 'roll_back_healing')
 
@@ -159,7 +159,7 @@ class Rig:
         )
 
     def shape_error_mm(self, points):
-        """RMS error of points relative to each other [mm], after the best rigid motion."""
+        """Return the RMS error of relative positions of points [mm], after the best rigid motion."""
         true = np.concatenate(
             [
                 body.xyz_mm @ np.swapaxes(self.motion.rotation[body.name], 1, 2)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the pathologies, output a JSON line for each when it is measured, and write the page."""
+"""Run the pathologies, store each result as a JSON line at once, and write the page."""
 
 import argparse
 import json

@@ -398,7 +398,7 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
     assert node.running and 'Traceback' not in node.log
 
     def unknown():
-        """Publish an exposure that is too late for the last state, one view after the other."""
+        """Publish the next exposure that is too late for the last state; return its status."""
         count = len(found['b'])
         show(last + 1, START_NS + next(late) * 10**9)
         client.wait_until(lambda: len(found['b']) > count, what='its markers')

@@ -159,7 +159,7 @@ class Rig:
         )
 
     def shape_error_mm(self, points):
-        """Return the RMS error of relative positions of points [mm], after the best rigid motion."""
+        """Return the RMS error of relative point positions [mm], after the best rigid motion."""
         true = np.concatenate(
             [
                 body.xyz_mm @ np.swapaxes(self.motion.rotation[body.name], 1, 2)

@@ -15,9 +15,7 @@ from fluoro_calib_ros.nodes.messages.rig_orientation import orientation_from_mes
 
 
 def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tracking):
-    """Calibrate twice in mid-stream: every exposure is reconstructed with its own
-    orientation.
-    """
+    """Calibrate twice in mid-stream: each exposure is reconstructed with its own orientation."""
     client = graph.client
     graph.both_nodes(tmp_path / 'calibrations', collect='request', model='none')
     node = graph.start('reconstruction_node')

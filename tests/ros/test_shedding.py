@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""config/shed_floods.xml: a message that does not fit into a waiting reader's queue is resent."""
+"""config/shed_floods.xml: messages that find no place while a reader waits are sent again."""
 
 import os
 import subprocess

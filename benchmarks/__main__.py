@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Speed on one thread, side by side with COLMAP's bundle adjuster and scikit-learn.
+"""Speed on one thread, compared with COLMAP's bundle adjuster and scikit-learn.
 
 python -m benchmarks                      all tables, written to docs/how_good/speed.md
 python -m benchmarks scaling adjustment   these only, printed
@@ -33,7 +33,7 @@ from .timing import section, timed
 
 
 def exposures() -> tuple[VirtualRig, dict[str, list[Frame]]]:
-    """Virtual rig and 15 exposures of it by fluoroscope a, of about 132 targets each."""
+    """Return a virtual rig and 15 exposures of about 132 targets each by its fluoroscope a."""
     rig = virtual_rig(1)
     return rig, {
         'a': simulate_exposures(rig, 15, 1, detection=Detection(beads=(130, 134))).frames['a']
@@ -41,7 +41,7 @@ def exposures() -> tuple[VirtualRig, dict[str, list[Frame]]]:
 
 
 def models() -> list[CalibrationOptions]:
-    """CalibrationOptions of all correction models."""
+    """Return CalibrationOptions for each correction model."""
     return [CalibrationOptions(model) for model in model_choices()]
 
 
@@ -108,7 +108,7 @@ def calibration_section() -> str:
 
 
 def adjustment_section() -> str:
-    """Compare one adjustment with COLMAP."""
+    """Compare an adjustment with one by COLMAP."""
     return section(
         'One adjustment compared with COLMAP',
         'All targets in all exposures, Student-t noise of fixed scale, interior orientation '
@@ -121,7 +121,7 @@ def adjustment_section() -> str:
 
 
 def scaling_section() -> str:
-    """Time and memory by the number of exposures."""
+    """Measure time and memory by the number of exposures."""
     return section(
         'Many exposures',
         'One adjustment with surveyed coordinates and a given noise model. Each size runs in a '
@@ -132,9 +132,9 @@ def scaling_section() -> str:
 
 
 def profile_section() -> str:
-    """Where the time of the self-calibration goes."""
+    """List the functions in which the self-calibration spends its time."""
     rig, frames = exposures()
-    calibrate(frames, rig.phantom)  # the first call does more, and is not counted
+    calibrate(frames, rig.phantom)  # untimed: the first call includes one-off work
     rows = list(profiling.rows(lambda: calibrate(frames, rig.phantom)))
     return section(
         'Where the time of a self-calibration goes',
@@ -156,7 +156,7 @@ SECTIONS = {
 
 
 def machine() -> str:
-    """The machine and the versions of the packages, in one sentence."""
+    """Return the machine and the versions of the packages in one sentence."""
     cpu = platform.processor() or platform.machine()
     information = Path('/proc/cpuinfo')
     if information.exists():
@@ -177,7 +177,7 @@ def machine() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the tables; with all of them, write them to docs/how_good/speed.md."""
+    """Print the tables; if all are selected, write them to docs/how_good/speed.md."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks', description=__doc__.splitlines()[0]
     )

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One adjustment of many image points by ours and by COLMAP: same problem, start and cost."""
+"""Adjust many image points with this package and COLMAP: same problem, initial values and cost."""
 
 from typing import Any
 
@@ -20,8 +20,8 @@ from .timing import timed
 
 NOISE = Noise('student_t', 0.25, 5.0)
 SIZES = (15, 150)  # exposures
-HELD_EVERY = 10  # every tenth object point is held: a datum that COLMAP can express
-# Ceres stops at this relative decrease of its cost. It then equals ours to ten digits.
+HELD_EVERY = 10  # every tenth object point is fixed: a datum that COLMAP can express
+# Ceres stops at this relative decrease of its cost, which then equals ours to ten digits.
 STOP = {
     'function_tolerance': 1e-11,
     'gradient_tolerance': 0.0,
@@ -31,9 +31,9 @@ STOP = {
 
 
 def large_network(exposures: int, seed: int = 0) -> tuple[Network, Parameters]:
-    """Network with every bead of the virtual rig in every exposure, and disturbed start values.
+    """Return a network with all beads in all exposures, and disturbed initial values.
 
-    The noise is Student-t.
+    The beads are those of the virtual rig; the noise is Student-t.
     """
     rng = np.random.default_rng([seed, exposures])
     rig = virtual_rig(1)
@@ -56,7 +56,7 @@ def large_network(exposures: int, seed: int = 0) -> tuple[Network, Parameters]:
         rig.phantom.sd_mm,
         np.array([True]),
     )
-    # Errors of the size of resections of distorted images.
+    # As large as the errors of resections from distorted images.
     turn = matrix_from_vector(rng.normal(0, 2e-3, position.shape))
     start = Parameters(
         fluoroscope.interior[None] + [[5.0, -5.0, 40.0]],
@@ -68,7 +68,7 @@ def large_network(exposures: int, seed: int = 0) -> tuple[Network, Parameters]:
 
 
 def compare_with_colmap(exposures: int, repeats: int = 3) -> list[str]:
-    """Table row: time and cost of an adjustment, ours and COLMAP's."""
+    """Return a table row with time and cost of an adjustment by this package and by COLMAP."""
     network, start = large_network(exposures)
     held = np.arange(len(network.survey_mm)) % HELD_EVERY == 0
     network = with_datum(network, held)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Images of a virtual fluoroscope: dark beads on a smooth background, with noise."""
+"""Images of a virtual fluoroscope: dark beads on a smooth background with noise."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, DTypeLike
 
 BEAD_PX = 3.0  # standard deviation of a blob
 CONTRAST = 0.55  # fraction of the light that a bead absorbs
-REACH = 5.5  # standard deviations to which a blob is drawn: the rest does not show in 16 bits
-BRIGHTNESS = 0.78  # grey value in the middle of the image, as a fraction of the largest one
+REACH = 5.5  # extent of a drawn blob, in standard deviations: beyond, it is invisible in 16 bits
+BRIGHTNESS = 0.78  # grey value in the middle of the image, as a fraction of the maximum
 
 
 def bead_image(
@@ -25,8 +25,8 @@ def bead_image(
 ) -> np.ndarray:
     """Draw an image of beads.
 
-    A bead attenuates what is behind it, so two of them in one place absorb more than one. Beads
-    off the image are drawn as far as they reach into it.
+    Each bead attenuates the light behind it, so two overlapping beads absorb more than one. Beads
+    outside the image are drawn as far as they extend into it.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def bead_image(
 
 
 def background(image_size: tuple[int, int]) -> np.ndarray:
-    """Light (h, w) from 0 to 1 without any object: brightest in the middle, darker to one side."""
+    """Return object-free light (h, w) from 0 to 1: brightest in the middle, darker to one side."""
     width, height = image_size
     x = np.linspace(-1, 1, width, dtype=np.float32)
     y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
@@ -72,7 +72,7 @@ def background(image_size: tuple[int, int]) -> np.ndarray:
 def _draw_bead(
     image: np.ndarray, uv: tuple[float, float], bead_px: float, contrast: float
 ) -> None:
-    """Take the light of one bead at a pixel uv off an image (h, w)."""
+    """Subtract the light absorbed by a bead at pixel uv from an image (h, w)."""
     u, v = uv
     if not (np.isfinite(u) and np.isfinite(v)):
         return
@@ -89,7 +89,7 @@ def _draw_bead(
 
 
 def _range_around(centre: float, reach: float) -> slice:
-    """Pixels of a row or column, from 0 on, within a reach of a coordinate."""
+    """Return the slice of nonnegative pixels of a row or column within `reach` of a coordinate."""
     start = max(0, int(np.ceil(centre - reach)))
     stop = max(0, int(np.floor(centre + reach)) + 1)
     return slice(start, stop)

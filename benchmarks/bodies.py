@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How well poses of bodies, their motion and joint angles are known, out of sample.
+"""Out-of-sample accuracy of body poses, their motion and joint angles.
 
-The generator shares no code with the package: rigs, projection, bodies and motion are made here,
-with scipy's rotations. Each figure stands beside its bound (Cramer-Rao, from derivatives by
-differences), or beside the best Butterworth filter, whose cutoff is chosen by the truth. Writes a
+The generator shares no code with the package: rigs, projection, bodies and motion are created here
+with scipy's rotations. Each figure is compared with its Cramer-Rao bound, from finite differences,
+or with the best Butterworth filter, whose cutoff is chosen using the truth. Writes a
 section of docs/how_good.md: python -m benchmarks.bodies
 """
 
@@ -41,14 +41,14 @@ CUTOFFS_HZ = np.geomspace(1.5, 110, 40)
 
 @dataclass(frozen=True)
 class Rig:
-    """Views at given angles about the vertical axis, source to object and to detector [mm]."""
+    """Views at given angles about the vertical axis; distances from the source [mm]."""
 
     angles_deg: tuple[float, ...]
     object_mm: float = 1000.0
     principal_px: float = 3300.0
 
     def orientation(self) -> RigOrientation:
-        """Return it as the package has it, exactly known."""
+        """Return the exact orientation of the rig as an object of the package."""
         count = len(self.angles_deg)
         names = tuple('abcd'[:count])
         return RigOrientation(
@@ -63,7 +63,7 @@ class Rig:
         )
 
     def views(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Rotations rig -> sensor, and sources."""
+        """Return the rotations from rig to sensor, and the sources."""
         out = []
         for angle in self.angles_deg:
             turn = Rotation.from_euler('y', -angle, degrees=True).as_matrix()
@@ -71,7 +71,7 @@ class Rig:
         return out
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Image points (F, n, 2) of points (n, 3)."""
+        """Return image points (F, n, 2) of points (n, 3)."""
         out = []
         for turn, source in self.views():
             x, y, z = turn @ (points - source).T
@@ -81,7 +81,7 @@ class Rig:
     def bound(
         self, xyz: np.ndarray, rotation: Rotation, place: np.ndarray, sd: float
     ) -> np.ndarray:
-        """Cramer-Rao covariance (6, 6) of a pose about the centre of markers (m, 3)."""
+        """Return the Cramer-Rao covariance (6, 6) of a pose about the centre of markers (m, 3)."""
 
         def image(d: np.ndarray) -> np.ndarray:
             turned = (Rotation.from_rotvec(d[3:]) * rotation).apply(xyz)
@@ -97,7 +97,7 @@ class Rig:
 
 
 def seen_by(rig: Rig, ids: np.ndarray, uv: np.ndarray, sd: float) -> IntersectedViews:
-    """Return the views of image points (F, n, 2), NaN where one is lost."""
+    """Return the views of image points (F, n, 2); NaN marks lost points."""
     count = len(ids)
     views = [
         CorrectedView(ids, of_view, np.full(count, sd), np.zeros(count), np.zeros(count, bool))
@@ -112,7 +112,7 @@ FLAG = Rig((0.0, 60.0), object_mm=1000.0, principal_px=4500.0)
 
 
 def single_exposures(rng: np.random.Generator, trials: int) -> Iterable[list[str]]:
-    """Rows of a table: RMSE of one exposure over its bound, and NSE."""
+    """Yield table rows: RMSE of single exposures relative to the bound, and NSE."""
     cases = [
         (markers, views, noise)
         for markers, views, noise in ((3, 2, 0.25), (4, 2, 0.25), (6, 2, 0.25), (12, 2, 0.25))
@@ -143,11 +143,11 @@ def single_exposures(rng: np.random.Generator, trials: int) -> Iterable[list[str
 def one_pose(
     rig: Rig, rng: np.random.Generator, markers: int, noise: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Error (6,), bound and claimed covariance (6, 6) of a random pose."""
+    """Return the error (6,), bound and claimed covariance (6, 6) of a random pose."""
     xyz = spread(rng, markers)
     rotation = Rotation.random(random_state=rng)
     place = rng.uniform(-30, 30, 3)
-    # The exposure before, which tells where a body is that one view sees alone.
+    # A body that is seen in one view only needs a previous exposure to locate it.
     tracker = BodyTracker(
         rig.orientation(), [Body('body', np.arange(markers), xyz, 0 * xyz[:, 0])]
     )
@@ -172,7 +172,7 @@ def from_one_view(
     body: tuple[np.ndarray, Rotation, np.ndarray],
     noise: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the same for a body whose second view is lost after an exposure."""
+    """Return the same for a body whose second view is lost after one exposure."""
     xyz, rotation, place = body
     ids = np.arange(len(xyz))
     tracker = BodyTracker(rig.orientation(), [Body('body', ids, xyz, 0 * xyz[:, 0])])
@@ -180,7 +180,7 @@ def from_one_view(
     tracker.add(seen_by(rig, ids, uv + rng.normal(0, noise, uv.shape), noise), 0, 1)
     uv = uv + rng.normal(0, noise, uv.shape)
     uv[1] = np.nan
-    # Long after, so that the first exposure tells little.
+    # So much later that the first exposure contributes little information.
     frame = tracker.add(seen_by(rig, ids, uv, noise), 1, 5_000_000)
     assert frame is not None and frame.frame.alone[0]
     alone = Rig(rig.angles_deg[:1])
@@ -198,7 +198,7 @@ def from_one_view(
 
 
 def pose_error(frame: object, rotation: Rotation, place: np.ndarray) -> np.ndarray:
-    """Error (6,) of the first body of an exposure."""
+    """Return the error (6,) of the first body of an exposure."""
     found = frame.frame  # type: ignore[attr-defined]
     turn = Rotation.from_matrix(found.rotation[0])
     return np.concatenate([found.centre_mm[0] - place, (turn * rotation.inv()).as_rotvec()])
@@ -207,13 +207,13 @@ def pose_error(frame: object, rotation: Rotation, place: np.ndarray) -> np.ndarr
 def centred_bound(
     rig: Rig, xyz: np.ndarray, rotation: Rotation, place: np.ndarray, sd: float
 ) -> np.ndarray:
-    """Bound about the centre of the markers."""
+    """Return the bound about the centre of the markers."""
     middle = xyz.mean(axis=0)
     return rig.bound(xyz - middle, rotation, place + rotation.apply(middle), sd)
 
 
 def spread(rng: np.random.Generator, markers: int) -> np.ndarray:
-    """Markers (m, 3) within 30 mm, centred, and not near a line."""
+    """Draw centred markers (m, 3) within 30 mm that are not nearly collinear."""
     while True:
         xyz = rng.uniform(-15, 15, (markers, 3))
         xyz -= xyz.mean(axis=0)
@@ -227,19 +227,19 @@ PARTS = (slice(0, 3), slice(3, 6))
 
 
 def gait(t: np.ndarray) -> np.ndarray:
-    """Six harmonics of a step a second [mm]."""
+    """Return six harmonics at one step per second [mm]."""
     size = (60, 20, 7, 3, 1.5, 0.7)
     return np.asarray(sum(a * np.sin(2 * np.pi * (k + 1) * t + k) for k, a in enumerate(size)))
 
 
 def chewing(t: np.ndarray) -> np.ndarray:
-    """Four harmonics of 1.6 Hz [mm]."""
+    """Return four harmonics of 1.6 Hz [mm]."""
     size = (6, 2.5, 0.7, 0.25)
     return np.asarray(sum(a * np.sin(3.2 * np.pi * (k + 1) * t + k) for k, a in enumerate(size)))
 
 
 def reach(t: np.ndarray) -> np.ndarray:
-    """Three movements of minimum jerk, from rest to rest in 0.2 s [mm]."""
+    """Return three minimum-jerk movements of 0.2 s, from rest to rest [mm]."""
     out = np.zeros_like(t)
     for start, size in ((0.4, 80.0), (0.9, -60.0), (1.4, 40.0)):
         s = np.clip((t - start) / 0.2, 0, 1)
@@ -248,7 +248,7 @@ def reach(t: np.ndarray) -> np.ndarray:
 
 
 def landing(t: np.ndarray) -> np.ndarray:
-    """A fall, and damped oscillations of 11 and 28 Hz after it [mm]."""
+    """Return a fall followed by damped oscillations of 11 and 28 Hz [mm]."""
     s = np.clip(t - 1.0, 0, None)
     hit = 8 * np.exp(-s / 0.06) * np.sin(22 * np.pi * s)
     hit += 4 * np.exp(-s / 0.02) * np.sin(56 * np.pi * s)
@@ -265,17 +265,17 @@ MOTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass(frozen=True)
 class Recorded:
-    """Errors (T, 6) of a body in a trial, smoothed and live, and normalised squares (T,)."""
+    """Errors (T, 6) of a body in a trial, smoothed and live; normalised squared errors (T,)."""
 
     smoothed: np.ndarray
     squares: np.ndarray
-    ratio: np.ndarray  # mean squares of position and rotation, ours and with the best cutoffs
+    ratio: np.ndarray  # mean squares of position and rotation, ours and with best cutoffs
     live: np.ndarray
     live_squares: np.ndarray
 
 
 def record(motion: Callable[[np.ndarray], np.ndarray], lost: float, seed: int) -> list[Recorded]:
-    """Follow two bodies of four markers through a trial."""
+    """Track two bodies of four markers through a trial."""
     rng = np.random.default_rng(seed)
     rig = Rig((0.0, 60.0))
     t = np.arange(0, 2, 1 / RATE_HZ)
@@ -315,7 +315,7 @@ def record(motion: Callable[[np.ndarray], np.ndarray], lost: float, seed: int) -
 
 
 def errors(poses: BodyPoses, turn: Rotation, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (T, 6) of poses, NaN where there is none, and their normalised squares (T,)."""
+    """Return errors (T, 6) of poses, NaN where unknown, and normalised squared errors (T,)."""
     known = poses.known
     error = np.full((len(known), 6), np.nan)
     error[known, :3] = poses.position_mm[known] - place[known]
@@ -328,13 +328,13 @@ def errors(poses: BodyPoses, turn: Rotation, place: np.ndarray) -> tuple[np.ndar
 
 
 def compared(error: np.ndarray, poses: BodyPoses, turn: Rotation, place: np.ndarray) -> np.ndarray:
-    """Mean squares (2, 2) of position and rotation, of errors and by the best Butterworth filters.
+    """Return mean squares (2, 2) of position and rotation, of errors and of the best filters.
 
-    poses: of single exposures, which the filters take; their cutoffs are chosen by the truth. Both
-    are compared in the exposures from the first to the last of these poses.
+    poses: single-exposure poses, the input of the Butterworth filters. Their cutoffs are chosen
+    using the truth. Both are compared in the exposures from the first to the last of these poses.
     """
     sd = poses.sd[:, :3].max(axis=1)
-    # As a lab would, without poses that one view alone gives: their depth is unsure.
+    # As in lab practice, exclude poses from a single view, because their depth is uncertain.
     known = np.flatnonzero(poses.known & (sd < 5 * np.nanmedian(sd)))
     rows = np.arange(known[0], known[-1] + 1)
     away = (Rotation.from_matrix(poses.rotation[known]) * turn[known].inv()).as_rotvec()
@@ -350,7 +350,7 @@ def compared(error: np.ndarray, poses: BodyPoses, turn: Rotation, place: np.ndar
 
 
 def motions(trials: int) -> Iterable[list[str]]:
-    """Rows of a table: smoothing against the best Butterworth filter, and NSE."""
+    """Yield table rows: smoothing compared with the best Butterworth filter, and NSE."""
     for name, motion in MOTIONS.items():
         for lost in (0.0, 0.3):
             found = [one for seed in range(trials) for one in record(motion, lost, seed)]
@@ -374,7 +374,7 @@ def motions(trials: int) -> Iterable[list[str]]:
 
 
 def joints(rng: np.random.Generator, trials: int) -> Iterable[list[str]]:
-    """Rows of a table: NSE of joint angles by their distance from gimbal lock."""
+    """Yield table rows: NSE of joint angles by their distance from gimbal lock."""
     for distance in (60.0, 20.0, 10.0, 5.0):
         squares = []
         for _ in range(trials):
@@ -405,7 +405,7 @@ def joints(rng: np.random.Generator, trials: int) -> Iterable[list[str]]:
 
 
 def jumps(frames: int) -> str:
-    """How far live poses jump where markers are lost to one or two in a view, for 2 to 80 ms."""
+    """Measure jumps of live poses when only one or two markers per view remain, for 2 to 80 ms."""
     rng = np.random.default_rng(5)
     rig = Rig((0.0, 60.0))
     xyz = spread(rng, 4)
@@ -460,7 +460,7 @@ def jumps(frames: int) -> str:
 
 
 def cost(exposures: int = 1000) -> str:
-    """Milliseconds of an exposure with five bodies of six markers, beside the intersection."""
+    """Measure CPU times of poses and intersection: five bodies of six markers, per exposure."""
     rng = np.random.default_rng(0)
     rig = Rig((0.0, 60.0))
     shapes = [spread(rng, 6) for _ in range(5)]
@@ -484,7 +484,7 @@ def cost(exposures: int = 1000) -> str:
 
 
 def table(header: str, rows: Iterable[list[str]]) -> str:
-    """Return a table in Markdown, and print its rows as they come."""
+    """Return a Markdown table, and print its rows as they are generated."""
     names = header.split('|')
     lines = [' | '.join(names), '|'.join(['---'] + ['---:'] * (len(names) - 1))]
     for row in rows:
@@ -527,7 +527,7 @@ Angles of a Cardan joint by their distance from gimbal lock, for single exposure
 
 
 def main() -> None:
-    """Measure and write the section."""
+    """Run the measurements and write the section."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--trials', type=int, default=200, help='random rigs of a row')
     parser.add_argument('--recordings', type=int, default=4, help='recordings of a row')

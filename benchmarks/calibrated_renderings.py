@@ -7,9 +7,9 @@
     python -m benchmarks.calibrated_renderings --rows cube-36 --seeds 3 --first 10
 
 Renderer, distortions and poses are those of `benchmarks.renderings`, which shares no code with the
-package. Each calibration has one fluoroscope and a distortion of its own; the survey of the
-phantom has errors. It is tested with noise-free image points in new poses, which are corrected and
-resected with the true beads.
+package. Each calibration has one fluoroscope with its own distortion; the survey of the phantom
+has errors. A calibration is tested with noise-free image points in new poses, which are corrected
+and resected with the true beads.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from .renderings import (
 )
 
 IMAGES = 16
-TESTS = 12  # new poses
+TESTS = 12  # new poses per calibration
 SURVEY_SD_MM = 0.05
 NO_NOISE_PX = 1e-4
 DEFAULT_ROWS = (
@@ -84,7 +84,7 @@ class Rig:
 
     @classmethod
     def drawn(cls, row: Row, rng: np.random.Generator) -> Rig:
-        """Draw one."""
+        """Draw a random rig."""
         target = row.target(rng)
         survey = target.xyz + rng.normal(0, SURVEY_SD_MM, target.xyz.shape)
         return cls(target, survey, Distortion(rng, row.distortion_px))
@@ -110,7 +110,7 @@ class Rig:
     def tested(
         self, calibration: FluoroscopeCalibration, pose: tuple[np.ndarray, np.ndarray]
     ) -> Tested:
-        """Test a calibration in a new pose."""
+        """Return the result of testing a calibration in a new pose."""
         rotation, source = pose
         uv = projected((self.target.xyz - source) @ rotation.T, self.bend)
         there = in_image(uv)
@@ -132,7 +132,7 @@ class Rig:
     def errors(
         self, calibration: FluoroscopeCalibration, fitted: np.ndarray, uv: np.ndarray
     ) -> np.ndarray:
-        """Errors (n, 2) [px] of a correction at pixels uv; its gauge is over fitted (m, 2)."""
+        """Return errors (n, 2) [px] of a correction at pixels uv; gauge over fitted (m, 2)."""
         _, _, truth = truth_in_gauge(
             _Truth(np.array([(SIZE - 1) / 2, (SIZE - 1) / 2, PRINCIPAL_PX]), self.correction),
             fitted,
@@ -142,13 +142,13 @@ class Rig:
         return np.asarray(calibration.correction(uv).duv - truth(uv))
 
     def correction(self, uv: np.ndarray) -> np.ndarray:
-        """True corrections (n, 2) [px] of pixels (n, 2)."""
+        """Return true corrections (n, 2) [px] of pixels (n, 2)."""
         return np.asarray(uv - self.bend.undistorted(uv))
 
 
 @dataclass(frozen=True)
 class _Truth:
-    """A fluoroscope as `truth_in_gauge` takes it."""
+    """A fluoroscope with the interface that `truth_in_gauge` expects."""
 
     interior: np.ndarray
     distortion: Callable[[np.ndarray], np.ndarray]
@@ -161,11 +161,11 @@ class Tested:
     uv: np.ndarray
     residuals: np.ndarray
     sd: np.ndarray
-    used: float  #: share of the points that are within the calibrated area
+    used: float  #: fraction of the points within the calibrated area
 
 
 def row_of(name: str, seed: int) -> str:
-    """Return the row of a calibration."""
+    """Return the table row of a calibration."""
     row = ROWS[name]
     rng = np.random.default_rng([seed, 77, *name.encode()])
     rig = Rig.drawn(row, rng)
@@ -202,7 +202,7 @@ def row_of(name: str, seed: int) -> str:
 
 
 def rows(names: list[str], first: int, seeds: int) -> Iterator[str]:
-    """Yield the rows of the table, and print each."""
+    """Yield the rows of the table, printing each."""
     for name in names:
         for seed in range(first, first + seeds):
             row = row_of(name, seed)

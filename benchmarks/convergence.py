@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Convergence on random rigs with bad start values and false matches.
+"""Convergence on random rigs with poor initial values and false matches.
 
 No wrong result may be reported as converged.
 """
@@ -26,13 +26,13 @@ from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtu
 from tools.sections import write_section
 
 # Mean normalised squared error above which a result is wrong. A single coordinate exceeds 5
-# standard deviations once in a million; the errors of sources and attitudes of one calibration are
-# correlated, those of object points hardly.
+# standard deviations once in a million. The errors of sources and attitudes within a calibration
+# are correlated; those of object points hardly are.
 LIMITS = {'xp': 25.0, 'yp': 25.0, 'c': 25.0, 'T': 9.0, 'q': 9.0, 'object points': 1.6}
 
 
 def random_case(seed: int) -> dict[str, Any]:
-    """Random distortion strength, exposures, false matches and start value of c of a case."""
+    """Draw distortion strength, exposures, false matches and initial value of c of a case."""
     rng = np.random.default_rng([seed, 77])
     return {
         'strength': rng.uniform(0, 2),
@@ -43,7 +43,7 @@ def random_case(seed: int) -> dict[str, Any]:
 
 
 def outcome(seed: int) -> dict[str, Any]:
-    """Result of one case.
+    """Return the result of one case.
 
     'end' is 'converged', 'not converged' or 'refused'; 'wrong' lists the wrong quantities.
     """

@@ -6,9 +6,9 @@
     python -m benchmarks.decisions [--seeds 10] [--write docs/how_good.md]
 
 Beads of the virtual rig get the ids of other beads nearby. A calibration lists what does not fit;
-the suggestion is the first target that a point may be, or to leave it out. Then all suggestions
-are taken, and calibrations from the frames before and after reconstruct the beads in exposures
-that none of them used.
+the suggestion is the first target that a point may be, or to exclude it. Then all suggestions are
+followed, and calibrations from the frames before and after reconstruct the beads in exposures
+that neither of them used.
 """
 
 import argparse
@@ -33,15 +33,15 @@ from tools.sections import show_section
 from .survey import Case, out_of_sample
 
 EXPOSURES = 15
-SAME_PX = 5.0  # between an image point and its bead, in standard deviations of the noise
-CASES = (0.0, 0.01, 0.05, 0.2)  # part of the beads that get a wrong id
+SAME_PX = 5.0  # maximum distance of an image point from its bead, in sd of the noise
+CASES = (0.0, 0.01, 0.05, 0.2)  # fractions of the beads that get a wrong id
 Frames = Mapping[str, Sequence[Frame]]
 
 
 def true_ids(
     rig: VirtualRig, frames: Frames, poses: Sequence[Any]
 ) -> dict[tuple[str, int, int], set[int]]:
-    """Return the beads that may be at each image point: fluoroscope, exposure, id as given."""
+    """Return the possible beads of each image point, by fluoroscope, exposure and given id."""
     out: dict[tuple[str, int, int], set[int]] = {}
     noise = Detection().noise_px
     for fluoroscope in rig.fluoroscopes:
@@ -56,7 +56,7 @@ def true_ids(
 
 
 def suggested(doubtful: Iterable[Doubtful]) -> list[PointDecision]:
-    """Return the decisions that take all suggestions."""
+    """Return the decisions that follow all suggestions."""
     return [
         PointDecision('', one.fluoroscope, one.first, one.last, one.target_id, new_id)
         for one in doubtful
@@ -65,7 +65,7 @@ def suggested(doubtful: Iterable[Doubtful]) -> list[PointDecision]:
 
 
 def measured(part: float, seed: int) -> tuple[Counter[str], float, float]:
-    """Return counts of what is suggested, and errors [mm] before and after all suggestions."""
+    """Return counts of suggestions, and errors [mm] before and after following all of them."""
     rig = virtual_rig(seed)
     simulated = simulate_exposures(rig, EXPOSURES, seed, Detection(false_matches=part))
     truth = true_ids(rig, simulated.frames, simulated.poses)
@@ -90,27 +90,27 @@ def measured(part: float, seed: int) -> tuple[Counter[str], float, float]:
 
 
 def errors(one: Case, doubtful: Sequence[Doubtful], seed: int) -> tuple[float, float]:
-    """Return errors [mm] in unused exposures, with the frames as they are and after decisions."""
+    """Return errors [mm] in unused exposures, with the original frames and after decisions."""
     before = out_of_sample(one, one.rig.phantom, one.frames, seed)
     if not doubtful:
         return before, before
     try:
         repaired, _ = decided(one.frames, suggested(doubtful))
-    except DataError as error:  # two points with one suggestion
+    except DataError as error:  # two points with the same suggestion
         print(f'seed {seed}{error}', file=sys.stderr)
         return before, float('nan')
     return before, out_of_sample(one, one.rig.phantom, repaired, seed)
 
 
 def row(seeds: Iterable[int], part: float) -> str:
-    """Row of the table of a case."""
+    """Return the table row of a case."""
     count: Counter[str] = Counter()
     both = []
     for seed in seeds:
         found, *of_seed = measured(part, seed)
         count += found
         both.append(of_seed)
-    before, after = np.mean(both, axis=0)  # NaN where a table was refused
+    before, after = np.mean(both, axis=0)  # NaN if a table was refused
     refused = int(np.isnan(both).any(axis=1).sum())
     return (
         f'| {100 * part:g} % | {count["false"]} of {count["points"]} | {count["listed"]} | '
@@ -121,7 +121,7 @@ def row(seeds: Iterable[int], part: float) -> str:
 
 
 def section(seeds: int) -> str:
-    """The section of docs/how_good.md."""
+    """Return the section of docs/how_good.md."""
     lines = [
         '## Doubtful image points',
         '',

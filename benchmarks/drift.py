@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The drift watch, end to end on virtual rigs: false alarms, delays and reported drifts.
+"""End-to-end test of the drift watch on virtual rigs: false alarms, delays and reported drifts.
 
-A rig is calibrated with 15 exposures, from which its orientation is taken, too. Then 30 markers in
-five rigid clusters move through it. They are corrected, checked by their epipolar residuals and
-intersected as in the stream. The motions repeat, the noise does not. Frames are handed over block
-by block, which makes no difference to the watch and is faster than real time.
+A rig is calibrated with 15 exposures, which also give its orientation. Then 30 markers in five
+rigid clusters move through it. They are corrected, checked by their epipolar residuals and
+intersected as in the stream. The motions repeat, the noise does not. Frames are passed in blocks,
+which makes no difference to the watch and is faster than real time.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ RATE_HZ = 120
 NOISE_PX = 0.25
 FALSE_MATCHES = 0.01
 REJECT = 4.0
-FRAMES = 30  # of a block of 0.25 s
+FRAMES = 30  # in a block of 0.25 s
 CLUSTERS = 5
 BEADS = 6
-PERIOD_S = 60  # of one motion
+PERIOD_S = 60  # period of the motion
 MOTIONS = 3
 IDS = np.arange(1001, 1001 + CLUSTERS * BEADS)
 SIZE = 1024
@@ -67,8 +67,8 @@ QUARTERS = {
     'lower right': (1, 1),
 }
 WHOLE = 'whole image'
-WITHIN_S = 5.0  # in which a drift is to be found
-AFTER_S = 20.0  # after which it counts as not found
+WITHIN_S = 5.0  # time within which a drift should be detected
+AFTER_S = 20.0  # time after which a drift counts as not detected
 
 # Shift (k, 2) [px] of pixels (k, 2) of a fluoroscope at a time [s].
 Shift = Callable[[str, np.ndarray, float], np.ndarray]
@@ -93,12 +93,12 @@ class Scene:
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """The bodies, their shapes unknown."""
+        """Return the bodies, with unknown shapes."""
         ids = IDS.reshape(CLUSTERS, BEADS).tolist()
         return declared_bodies(f'bone {i + 1}: {str(own)[1:-1]}' for i, own in enumerate(ids))
 
     def watch(self, options: DriftOptions | None = None, clusters: bool = True) -> DriftWatch:
-        """A DriftWatch of the scene."""
+        """Create a DriftWatch for the scene."""
         return DriftWatch(
             dict.fromkeys(self.names, (SIZE, SIZE)),
             options,
@@ -108,7 +108,7 @@ class Scene:
 
 
 def markers(rng: np.random.Generator, beads: np.ndarray, seconds: float) -> np.ndarray:
-    """Positions (frames, 30, 3) [mm] of rigid clusters on the bones of a moving joint.
+    """Return positions (frames, 30, 3) [mm] of rigid clusters on the bones of a moving joint.
 
     beads (5, 6, 3): shapes of the clusters [mm].
     """
@@ -139,9 +139,9 @@ def markers(rng: np.random.Generator, beads: np.ndarray, seconds: float) -> np.n
 
 
 def scene(seed: int, source: str = 'exposures') -> Scene:
-    """Scene of a rig.
+    """Create the scene of a rig.
 
-    Its orientation comes from the 'exposures' of the calibration, or a 'capture' of the phantom.
+    source: orientation from the 'exposures' of the calibration or a 'capture' of the phantom.
     """
     rig = virtual_rig(seed)
     exposures = simulate_exposures(rig, 15, seed).frames
@@ -169,7 +169,7 @@ def scene(seed: int, source: str = 'exposures') -> Scene:
 
 
 def false_matches(rng: np.random.Generator, uv: np.ndarray) -> np.ndarray:
-    """Pixels of which a fraction FALSE_MATCHES is displaced, as by another bead."""
+    """Return pixels of which a fraction FALSE_MATCHES is displaced, as if by another bead."""
     wrong = rng.random(uv.shape[:2]) < FALSE_MATCHES
     uv[wrong] += rng.uniform(-12, 12, (int(wrong.sum()), 2))
     return uv
@@ -178,7 +178,7 @@ def false_matches(rng: np.random.Generator, uv: np.ndarray) -> np.ndarray:
 def blocks(
     scene_: Scene, rng: np.random.Generator, first: int, count: int, drift: Shift | None = None
 ) -> Iterator[Block]:
-    """Blocks of the stream: pixels, corrected points, their systematic sd, and stamps.
+    """Yield blocks of the stream: pixels, corrected points, their systematic sd, and stamps.
 
     first: number of the first block; drift(name, uv, time_s): shift (k, 2) [px] of
     observed pixels (k, 2) at a time [s].
@@ -211,7 +211,7 @@ def blocks(
 
 
 def feed(scene_: Scene, watch: DriftWatch, block: Block, clusters: bool = True) -> DriftState:
-    """Hand a block of the stream to the watch; returns its state."""
+    """Pass a block of the stream to the watch; return the state of the watch."""
     seen, corrected, systematic, stamps = block
     a, b = scene_.names
     noise = [scene_.calibrations[name].image_sd for name in scene_.names]
@@ -245,7 +245,7 @@ def feed(scene_: Scene, watch: DriftWatch, block: Block, clusters: bool = True) 
 def intersected(
     scene_: Scene, uv: np.ndarray, correction_sd: np.ndarray, noise_px: Sequence[float]
 ) -> IntersectedViews:
-    """Views of an exposure from corrected pixels (2, n, 2) of all markers."""
+    """Return the views of an exposure from corrected pixels (2, n, 2) of all markers."""
     sigma = np.hypot(correction_sd, np.array(noise_px)[:, None])
     outside = np.zeros(sigma.shape, dtype=bool)
     views = MatchedViews(IDS, uv, sigma, correction_sd, outside)
@@ -264,9 +264,9 @@ class Drift:
     size : float
         [px]
     direction : float
-        Of the shift in the image [deg].
+        Direction of the shift in the image [deg].
     ramp_s : float
-        Time after which it has its size.
+        Time until the drift reaches its full size.
     """
 
     fluoroscope: str
@@ -277,16 +277,16 @@ class Drift:
 
     @property
     def vector(self) -> np.ndarray:
-        """Shift (2,) at full size [px]."""
+        """Return the shift (2,) at full size [px]."""
         angle = np.deg2rad(self.direction)
         return self.size * np.array([np.cos(angle), np.sin(angle)])
 
     def fraction(self, time_s: float) -> float:
-        """Fraction of its size at a time after its start [s]."""
+        """Return the fraction of the full size at a time after the start [s]."""
         return min(1.0, time_s / self.ramp_s) if self.ramp_s else 1.0
 
     def shift(self, name: str, uv: np.ndarray, time_s: float) -> np.ndarray:
-        """Shift (k, 2) [px] of observed pixels (k, 2) at a time after its start [s]."""
+        """Return the shift (k, 2) [px] of observed pixels (k, 2) at a time after the start [s]."""
         if name != self.fluoroscope or time_s < 0:
             return np.zeros_like(uv)
         inside = np.ones(len(uv), dtype=bool)
@@ -303,10 +303,10 @@ def false_alarms(
     options: DriftOptions | None = None,
     clusters: bool = True,
 ) -> Result:
-    """Alarms of a stream without drift.
+    """Count the alarms in a stream without drift.
 
-    Returns hours, the number of WARNs and ERRORs that began, the largest evidence over the
-    threshold of WARN, and the messages of the alarms.
+    Return hours, the number of transitions to WARN and ERROR, the largest ratio of the evidence to
+    the WARN threshold, and the messages of the alarms.
     """
     scene_ = scene(seed, source)
     watch = scene_.watch(options, clusters)
@@ -335,7 +335,7 @@ def false_alarms(
 
 
 def right_place(state: DriftState, quarter: str) -> bool:
-    """Whether the area of a state is the quarter, or a part of it."""
+    """Return whether the area of a state is the quarter or a part of it."""
     u0, v0, u1, v1 = np.array(state.area) / SIZE
     if quarter == WHOLE:
         return (u1 - u0) * (v1 - v0) >= 0.49
@@ -355,7 +355,7 @@ def detection(
     clusters: bool = True,
     after_s: float = AFTER_S,
 ) -> Result:
-    """Result of one drift: delays of WARN and ERROR [s] (inf: not found), and what is reported.
+    """Return the result of a drift: delays of WARN and ERROR [s] (inf: not found), and the report.
 
     Parameters
     ----------
@@ -387,13 +387,13 @@ def detection(
     stream = blocks(scene_, rng, first, round(after_s * RATE_HZ / FRAMES), shift)
     for number, block in enumerate(stream):
         state = feed(scene_, watch, block, clusters)
-        # A block is tested when the next one begins: that is the time of the alarm.
+        # A block is tested when the next one begins, which is the time of the alarm.
         delay = number * FRAMES / RATE_HZ
         if state.level >= WARN:
             out['warn'] = min(out['warn'], delay)
         if state.level == ERROR:
             out['error'] = min(out['error'], delay)
-            # The report counts at this time, or later if the drift is found later.
+            # Evaluate the report at this time, or later if the drift is detected later.
             if delay >= min(WITHIN_S, after_s - 1) or drift.ramp_s:
                 out.update(_reported(state, drift, delay))
                 break
@@ -401,9 +401,9 @@ def detection(
 
 
 def _reported(state: DriftState, drift: Drift, delay: float) -> Result:
-    """The report of an alarm about a drift, delay [s] after its start."""
+    """Evaluate the report of an alarm about a drift, delay [s] after its start."""
     along = float(drift.vector @ state.direction) * drift.fraction(delay)
-    if ' or ' in state.fluoroscope:  # down in one is up in the other
+    if ' or ' in state.fluoroscope:  # a downward drift in one equals an upward drift in the other
         along = abs(along)
     return {
         'kind': state.finding.kind.value,
@@ -419,7 +419,7 @@ def _reported(state: DriftState, drift: Drift, delay: float) -> Result:
 def started(
     seed: int, clusters: bool = True, source: str = 'exposures'
 ) -> tuple[Scene, DriftWatch, np.random.Generator, int]:
-    """Scene, its watch after the start, the generator, and the number of blocks of the start."""
+    """Return scene, watch after the start-up, generator, and number of blocks of the start-up."""
     scene_ = scene(seed, source)
     watch = scene_.watch(clusters=clusters)
     rng = np.random.default_rng([seed, 6])
@@ -437,14 +437,14 @@ def detections(
     quarters: Sequence[str] = tuple(QUARTERS),
     directions: int = 8,
 ) -> list[Result]:
-    """Results of `detection` for drifts over all quarters of both images."""
+    """Return results of `detection` for drifts over all quarters of both images."""
     scene_, watch, rng, learned = started(seed, clusters, source)
     out = []
     total = PERIOD_S * MOTIONS * RATE_HZ // FRAMES
     for name in scene_.names:
         for quarter in quarters:
             for k in range(directions):
-                first = learned + int(rng.integers(total))  # from anywhere in the motion
+                first = learned + int(rng.integers(total))  # at a random phase of the motion
                 drift = Drift(name, quarter, size, 360 * k / directions)
                 fresh = copy.deepcopy(watch)
                 out.append(detection(scene_, fresh, first, drift, rng, clusters))
@@ -452,7 +452,7 @@ def detections(
 
 
 def from_the_start(seed: int, size: float = 0.5, directions: int = 8) -> list[Result]:
-    """Results for drifts that exist before the start: only the calibration reveals them."""
+    """Return results for drifts present from the start, which only the calibration reveals."""
     scene_ = scene(seed)
     rng = np.random.default_rng([seed, 8])
     out = []
@@ -466,7 +466,7 @@ def from_the_start(seed: int, size: float = 0.5, directions: int = 8) -> list[Re
 
 
 def slow(seed: int, size: float = 0.5, hours: float = 1.0) -> list[Result]:
-    """Result for a drift that grows for hours, in a random quarter and direction."""
+    """Return the result for a drift that grows for hours, in a random quarter and direction."""
     scene_, watch, rng, learned = started(seed)
     quarter = str(rng.choice(list(QUARTERS)))
     direction = 45 * int(rng.integers(8))
@@ -475,7 +475,7 @@ def slow(seed: int, size: float = 0.5, hours: float = 1.0) -> list[Result]:
     return [detection(scene_, watch, learned, drift, rng, after_s=1.1 * hours * 3600)]
 
 
-# Title of a row, function, its arguments but the seed.
+# Title of a row, function, and its arguments except the seed.
 CASES: tuple[tuple[str, Callable[..., list[Result]], dict[str, Any]], ...] = (
     ('0.5 px, with clusters', detections, {}),
     ('0.5 px, orientation from one capture', detections, {'source': 'capture'}),
@@ -510,7 +510,7 @@ HEADER = [
 
 
 def row(title: str, sector: str, found: Sequence[Result]) -> list[str]:
-    """A row of the table of detections, from results of `detection`."""
+    """Return a row of the table of detections from results of `detection`."""
     delay = np.array([f['error'] for f in found])
     reported = [f for f in found if 'named' in f]
     error = np.array([f['size_error'] for f in reported])
@@ -553,10 +553,10 @@ def measure(
     processes: int = 1,
     chosen: Sequence[str] | None = None,
 ) -> Result:
-    """All results: {'alarms': dicts of false_alarms, 'cases': {title: dicts of detection}}.
+    """Return all results: {'alarms': dicts of false_alarms, 'cases': {title: dicts of detection}}.
 
-    rigs: of each case of drifts; alarm_rigs: without drift, hours [h] each, every third with the
-    orientation of a capture; chosen: titles of cases, None: all.
+    rigs: number for each case of drifts; alarm_rigs: number without drift, of hours [h] each, each
+    third with the orientation of a capture; chosen: titles of cases, None for all.
     """
     tasks: list[tuple[str, Callable[..., Any], dict[str, Any]]] = [
         (
@@ -585,7 +585,7 @@ def measure(
 
 
 def report(figures: Result) -> str:
-    """The results of `measure` as text."""
+    """Return the results of `measure` as text."""
     options = DriftOptions()
     alarms = figures['alarms']
     hours = sum(a['hours'] for a in alarms)

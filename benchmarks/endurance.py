@@ -5,9 +5,9 @@
 
     python -m benchmarks.endurance [--hours 1] [--rate 120]
 
-The frames of 2 x 120 Hz x 30 markers of an hour go through correction and reconstruction (with the
-drift watch and a subscriber of the point cloud) as fast as the nodes accept them: never more than
-a fraction of a queue ahead of the published points. The resident memory of both nodes is recorded
+Frames of one hour at 2 x 120 Hz with 30 markers pass through correction and reconstruction (with
+the drift watch and a point cloud subscriber) as fast as the nodes accept them, at most a fraction
+of a queue ahead of the published points. The resident memory of both nodes is recorded
 every minute of the stream.
 """
 
@@ -41,14 +41,14 @@ PAGE_MB = os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
 def resident_mb(process: subprocess.Popen[Any]) -> float:
-    """Resident memory [MB] of a process."""
+    """Return the resident memory [MB] of a process."""
     return int(Path(f'/proc/{process.pid}/statm').read_text().split()[1]) * PAGE_MB
 
 
 def wait_for_orientation(reader: Reader) -> None:
-    """Wait until the reconstruction node has an orientation and all its corrected streams.
+    """Wait until the reconstruction node has an orientation and receives all corrected streams.
 
-    Exposures before that would not come out, and no more are published than a part of a queue.
+    Earlier exposures would give no points, and publication would stop after part of a queue.
     """
     known: list[str] = []
 
@@ -59,7 +59,7 @@ def wait_for_orientation(reader: Reader) -> None:
     subscription = reader.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, 50)
     reader.wait(lambda: any(known), 60, 'the orientation')
     topics = [f'{name}/corrected_observations' for name in NAMES]
-    # One is the subscription of this process.
+    # One of the subscribers is this process.
     reader.wait(lambda: all(reader.count_subscribers(t) > 1 for t in topics), 30, 'the streams')
     reader.destroy_subscription(subscription)
 
@@ -105,7 +105,7 @@ def stream(reader: Reader, frames: int, rate_hz: float, note: Callable[[int], No
 
 
 def run(hours: float, rate_hz: float) -> dict[str, Any]:
-    """Results: exposures, frames in and out, seconds, and memory {node: [MB by minute]}."""
+    """Return the results: exposures, frames in and out, seconds, memory {node: [MB by minute]}."""
     isolate_ros_graph()
     rclpy.init(args=[])
     reader = Reader(*rig_of_the_simulator())
@@ -145,7 +145,7 @@ def run(hours: float, rate_hz: float) -> dict[str, Any]:
 
 
 def text_of(figures: dict[str, Any]) -> str:
-    """The results as text."""
+    """Return the results as text."""
     frames = figures['exposures']
     lines = [
         f'{frames} exposures of 2 x 30 markers in {figures["seconds"]:.0f} s.',

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A case of the validation experiment: calibrate with some exposures of a rig, test with others.
+"""Cases of the validation experiment: calibrate with some exposures of a rig, test with others.
 
 The reference is the ground truth of the virtual rig: bead coordinates, source positions and
-distortion field. A Case describes what is done, an Outcome contains the resulting numbers, so that
+distortion field. A Case describes the task and an Outcome contains the resulting numbers, so that
 cases can run in other processes.
 """
 
@@ -54,10 +54,10 @@ NOISE_PX = 0.25
 BEFORE = 'before'
 HELD = 'knn, interior fixed'
 KNOWN = 'known distortion'
-# In the order of the tables; models that CalibrationOptions refuses are left out.
+# In the order of the tables; models that CalibrationOptions refuses are excluded.
 MODELS = tuple(name for name in (*selectable_models(), AUTO) if name != 'none')
 RELATIVE = ('none', 'soft', 'hard')
-TEST_TOLERANCE = 1e-4  # decrease of F left by the adjustment of a test: a hundredth of a sigma
+TEST_TOLERANCE = 1e-4  # decrease of F at which a test adjustment stops: a hundredth of a sigma
 GRID_PX = 16  # spacing of the pixels at which the correction is compared with the truth
 
 
@@ -66,11 +66,11 @@ class Case:
     """A calibration of the experiment.
 
     seed of the rig; variant: BEFORE, HELD, KNOWN or a model (interior orientation estimated);
-    exposures: of the recording, of which every so many (10: every tenth) are for the calibration,
-    the others for the test; training: number of other exposures for the calibration, None: those;
-    joint: one adjustment for all fluoroscopes; relative: relative orientation constraint; survey:
-    factor of the standard deviation that is stated for the survey; rounds: largest number of them;
-    detail: residuals are wanted too.
+    exposures: number in the recording; every: step between the exposures for the calibration (10:
+    every tenth), the others are for the test; training: number of separate exposures for the
+    calibration, None: those of the recording; joint: adjust all fluoroscopes together; relative:
+    relative orientation constraint; survey: factor on the stated standard deviation of the survey;
+    rounds: maximum number; detail: whether to return residuals too.
     """
 
     seed: int
@@ -115,19 +115,19 @@ class Residuals:
     inlier: np.ndarray
 
     def cost(self) -> float:
-        """r^T C_r^-1 r, robustly weighted, in units of the simulated noise."""
+        """Return r^T C_r^-1 r, robustly weighted, in units of the simulated noise."""
         return float(np.sum(self.weight[:, None] * (self.residual / self.sd[:, None]) ** 2))
 
     def raw(self) -> np.ndarray:
-        """RMSE (2,) [px] of the inlier residuals."""
+        """Return the RMSE (2,) [px] of the inlier residuals."""
         return np.sqrt(np.mean(self.residual[self.inlier] ** 2, axis=0))
 
     def reweighted(self) -> np.ndarray:
-        """RMSE (2,) [px] of all residuals times the square root of their robust weight."""
+        """Return the RMSE (2,) [px] of all residuals times the square root of their weights."""
         return np.sqrt(np.mean(self.weight[:, None] * self.residual**2, axis=0))
 
     def together(self, other: Residuals) -> Residuals:
-        """The residuals of two fluoroscopes as one set."""
+        """Return the residuals of two fluoroscopes as one set."""
         return Residuals(
             *(
                 np.concatenate([getattr(r, f.name) for r in (self, other)])
@@ -138,7 +138,7 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a case; failed: the reason if it has no numbers.
+    """Result of a case; failed: the reason if there are no numbers.
 
     inside and outside (6,): RMSE [mm] in and out of sample of object points X, Y, Z and sources
     Xo, Yo, Zo; error_map (rows, columns, 2) [px] by fluoroscope: error of the correction over the
@@ -159,9 +159,9 @@ class Outcome:
     costs: tuple[np.ndarray, ...] = ()
 
     def image_px(self, name: str, within: np.ndarray | None = None) -> float:
-        """RMSE [px] of a coordinate of the correction over the calibrated area.
+        """Return the RMSE [px] of a coordinate of the correction over the calibrated area.
 
-        within: error map to whose area it is restricted.
+        within: error map whose area restricts the evaluation.
         """
         errors = self.error_map[name]
         if within is not None:
@@ -169,25 +169,25 @@ class Outcome:
         return float(np.sqrt(np.nanmean(errors**2)))
 
     def covered(self, name: str) -> float:
-        """Part of the image inside the calibrated area."""
+        """Return the fraction of the image inside the calibrated area."""
         return float(np.mean(np.isfinite(self.error_map[name][..., 0])))
 
     def points_mm(self) -> float:
-        """3-D RMSE [mm] of the object points out of sample."""
+        """Return the out-of-sample 3-D RMSE [mm] of the object points."""
         return float(np.linalg.norm(self.outside[:3]))
 
     def source_mm(self) -> float:
-        """3-D RMSE [mm] of the sources out of sample."""
+        """Return the out-of-sample 3-D RMSE [mm] of the sources."""
         return float(np.linalg.norm(self.outside[3:]))
 
 
 def available_models() -> tuple[str, ...]:
-    """Correction models that CalibrationOptions takes, in the order of the tables."""
+    """Return the correction models that CalibrationOptions accepts, in the order of the tables."""
     return tuple(name for name in MODELS if _accepted(model=name))
 
 
 def available_relative() -> tuple[str, ...]:
-    """Relative orientation constraints of CalibrationOptions, except 'none'."""
+    """Return the relative orientation constraints of CalibrationOptions, except 'none'."""
     return tuple(name for name in RELATIVE[1:] if _accepted(relative_orientation=name))
 
 
@@ -200,7 +200,7 @@ def _accepted(**options: Any) -> bool:
 
 
 def options_of(case: Case) -> CalibrationOptions:
-    """CalibrationOptions of the calibration of a case."""
+    """Return the CalibrationOptions of a case."""
     model, interior = {
         BEFORE: ('none', 'fixed'),
         HELD: ('knn', 'fixed'),
@@ -243,22 +243,22 @@ class Scene:
     def training(
         self, count: int | None, known: bool
     ) -> tuple[dict[str, list[Frame]], SimulatedExposures]:
-        """Frames by fluoroscope for the calibration.
+        """Return the frames for the calibration, by fluoroscope.
 
-        count: number of separate exposures; None: every so many of the recording.
+        count: number of separate exposures; None: a regular subset of the recording.
         """
         if count is None:
             return self._frames(
                 self.recording, known, lambda i: i % self._every == 0
             ), self.recording
-        # Exposures of their own, so that the test is the same for every count.
+        # Use separate exposures, so that the test is the same for every count.
         own = simulate_exposures(
             self.rig, count, 1000 * self._seed + count, Detection(NOISE_PX, self._false_matches)
         )
         return self._frames(own, known), own
 
     def test_network(self, fluoroscopes: tuple[str, ...], known: bool) -> Measured:
-        """Network of the test exposures, with start values from the true calibration."""
+        """Return a network of the test exposures, starting from the true calibration."""
         key = fluoroscopes, known
         if key not in self._tested:
             frames = self._frames(self.recording, known, lambda i: i % self._every != 0)
@@ -277,7 +277,7 @@ class Scene:
         known: bool,
         chosen: Callable[[int], bool] = lambda i: True,
     ) -> dict[str, list[Frame]]:
-        """Frames by fluoroscope; known: with the true distortion removed."""
+        """Return frames by fluoroscope; known: remove the true distortion."""
         out = {}
         for name, frames in simulated.frames.items():
             out[name] = [
@@ -288,7 +288,7 @@ class Scene:
         return out
 
     def field(self, name: str) -> DistortionField:
-        """True distortion of a fluoroscope."""
+        """Return the true distortion of a fluoroscope."""
         return next(f.distortion for f in self.rig.fluoroscopes if f.name == name)
 
     def errors(
@@ -298,7 +298,7 @@ class Scene:
         exposures: Iterable[tuple[str, int, np.ndarray]],
         simulated: SimulatedExposures,
     ) -> np.ndarray:
-        """RMSE (6,) [mm] of object points and of sources.
+        """Return the RMSE (6,) [mm] of object points and of sources.
 
         exposures: (fluoroscope, number, position_mm).
         """
@@ -314,21 +314,21 @@ class Scene:
 
 
 def _correction(distortion: DistortionField | None) -> Callable[[Frame], np.ndarray]:
-    """Correction of the image points of a frame; None: they are free of distortion."""
+    """Return the correction of the image points of a frame; None: they are free of distortion."""
     if distortion is None:
         return lambda frame: np.zeros_like(frame.uv)
     return lambda frame: distortion(frame.uv)
 
 
 def _undistorted(frame: Frame, uv: np.ndarray) -> Frame:
-    """A frame with other image points, without those that fall off the image."""
+    """Return a frame with other image points, without those that fall outside the image."""
     on = points_on_image(uv, frame.image_size)
     return replace(frame, target_id=frame.target_id[on], uv=uv[on])
 
 
 @functools.lru_cache(maxsize=2)
 def scene_of(*key: Any) -> Scene:
-    """The Scene with this key: cases of one scene should be run one after the other."""
+    """Return the Scene with this key; run cases of the same scene one after the other."""
     return Scene(*key)
 
 
@@ -337,7 +337,7 @@ def scene_of(*key: Any) -> Scene:
 
 
 def run_case(case: Case) -> Outcome:
-    """Outcome of a case."""
+    """Run a case and return its outcome."""
     known = case.variant == KNOWN
     scene = scene_of(*case.scene)
     frames, simulated = scene.training(case.training, known)
@@ -352,7 +352,7 @@ def run_case(case: Case) -> Outcome:
         seconds = time.perf_counter() - began
         with threadpool_limits(1):
             outside = errors_of_test(scene, case, job.calibrations)
-    except (DataError, np.linalg.LinAlgError) as error:  # a failure is a result, too
+    except (DataError, np.linalg.LinAlgError) as error:  # a failure is also a result
         return Outcome(failed=f'{type(error).__name__}: {error}')
     exposures = [
         (name, e.exposure, e.position_mm)
@@ -390,10 +390,10 @@ def run_case(case: Case) -> Outcome:
 def errors_of_test(
     scene: Scene, case: Case, calibrations: Mapping[str, FluoroscopeCalibration]
 ) -> np.ndarray:
-    """RMSE (6,) [mm] of the test exposures, adjusted with the calibrations held.
+    """Return the RMSE (6,) [mm] of the test exposures, adjusted with fixed calibrations.
 
-    The same as adjust_with_calibrations, except for the start values, and without covariances and
-    the adjustment before the correction, which are not needed here: a third of the time.
+    Same as adjust_with_calibrations except for the initial values, and without the covariances and
+    the adjustment before the correction, which are not needed here; takes a third of the time.
     """
     measured = scene.test_network(case.fluoroscopes, case.variant == KNOWN)
     correction, network = fixed_corrections(measured, calibrations)
@@ -419,7 +419,7 @@ def errors_of_test(
 
 
 def with_interior(measured: Measured, interior: np.ndarray) -> Parameters:
-    """Start values of a network with other interior orientations (F, 3) for the same image.
+    """Return initial values of a network for other interior orientations (F, 3), same image.
 
     A shift of the principal point is compensated by a rotation of the sensor, and another
     principal distance by another distance of the source.
@@ -439,15 +439,15 @@ def with_interior(measured: Measured, interior: np.ndarray) -> Parameters:
 
 
 def _details(job: CalibrationResult) -> dict[str, Any]:
-    """Residuals by fluoroscope and relative costs of a calibration."""
+    """Return residuals by fluoroscope and relative costs of a calibration."""
     residuals = {}
     costs: tuple[np.ndarray, ...] = ()
     for run in job.runs.values():
         network = run.measured.network
         after = run.after
         weight = after.noise.weight(after.q)
-        # C_r with the simulated noise as C_l: one unit for every variant, so that the costs can be
-        # compared.
+        # Use C_r with the simulated noise as C_l, the same unit for every variant, so that costs
+        # are comparable.
         redundancy = geometric_redundancy(network, after.parameters, Noise('gaussian', NOISE_PX))
         sd = NOISE_PX * network.sigma * np.sqrt(np.maximum(redundancy, 0.05))
         for f, name in enumerate(run.measured.fluoroscopes):
@@ -474,10 +474,10 @@ def error_over_image(
     training_uv: np.ndarray,
     image_size: tuple[int, int],
 ) -> np.ndarray:
-    """Errors (rows, columns, 2) [px] of corrected coordinates on a grid, NaN if not calibrated.
+    """Return errors (rows, columns, 2) [px] of a correction on a grid, NaN if not calibrated.
 
-    After the best projective map between corrected and true coordinates: a shift, scale, rotation
-    and tilt of the image plane belong to the orientation of the fluoroscope, not to its
+    These remain after the best projective map of corrected to true coordinates: shift, scale,
+    rotation and tilt of the image plane belong to the orientation of the fluoroscope, not to its
     distortion.
     """
     u, v = np.meshgrid(*(np.arange(GRID_PX / 2 - 0.5, size, GRID_PX) for size in image_size))
@@ -493,7 +493,7 @@ def error_over_image(
 
 
 def projective_residuals(uv: np.ndarray, ideal: np.ndarray) -> np.ndarray:
-    """Residuals (n, 2) of the least-squares projective map (8 parameters) of uv onto ideal."""
+    """Return residuals (n, 2) of the least-squares projective map (8 parameters) to ideal."""
     centre = np.mean(ideal, axis=0)
     half = np.max(np.ptp(ideal, axis=0)) / 2
     x, y = ((uv - centre) / half).T
@@ -501,7 +501,7 @@ def projective_residuals(uv: np.ndarray, ideal: np.ndarray) -> np.ndarray:
     one = np.ones_like(x)
     zero = np.zeros_like(x)
     h = np.array([1.0, 0, 0, 0, 1, 0, 0, 0])
-    for _ in range(5):  # Gauss-Newton: the linear solution minimises something slightly different
+    for _ in range(5):  # Gauss-Newton: the linear solution has a slightly different cost
         below = h[6] * x + h[7] * y + 1
         mapped = (
             np.stack([h[0] * x + h[1] * y + h[2], h[3] * x + h[4] * y + h[5]], axis=1)

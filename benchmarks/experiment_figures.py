@@ -23,7 +23,7 @@ from fluoro_calib_ros.simulation.rig import IMAGE_SIZE
 from .experiment import BEFORE, GRID_PX, HELD, KNOWN, Residuals
 from .experiment_plan import Outcomes, Plan
 
-# Okabe and Ito: colour-blind people can tell them apart, and the markers differ too.
+# Okabe-Ito palette: distinguishable with colour blindness; the markers differ, too.
 LOOK = {
     'knn': ('#E69F00', 's'),
     'local_linear': ('#56B4E9', 'o'),
@@ -41,21 +41,21 @@ PANEL = {
     'knn': 'after w/ IOP\n(kNN, interior estimated)',
 }
 STRIPES = 24
-LIMIT = 10.0  # standard deviations shown to either side
-# F and G by round, in percent of the first.
+LIMIT = 10.0  # range shown, in standard deviations to either side
+# F and G by round, in percent of the first round.
 Costs = tuple[np.ndarray, ...]
-COLOURS = 96  # of a picture: no visible difference at a third of the size
+COLOURS = 96  # palette size of a picture: no visible difference at a third of the file size
 
 
 def title_of(variant: str) -> str:
-    """Title of a panel: the paper's name of the variant, or the model."""
+    """Return the title of a panel: the paper's name of the variant, or the model."""
     return PANEL.get(variant, f'{variant}\n(interior estimated)')
 
 
 def write_all(plan: Plan, outcomes: Outcomes, folder: str | os.PathLike[str]) -> dict[str, str]:
     """Write all pictures of the experiment.
 
-    Returns their paths by key: 'figure 1' to 'figure 10', 'curves', 'map'.
+    Return their paths by key: 'figure 1' to 'figure 10', 'curves', 'map'.
     """
     os.makedirs(folder, exist_ok=True)
     paths = {}
@@ -68,7 +68,7 @@ def write_all(plan: Plan, outcomes: Outcomes, folder: str | os.PathLike[str]) ->
 
 
 def _small(png: bytes, colours: int) -> bytes:
-    """The same picture with a palette."""
+    """Reduce a PNG image to a palette of colours."""
     buffer = io.BytesIO()
     picture = Image.open(io.BytesIO(png)).convert('RGB')
     picture.quantize(colours, dither=Image.Dither.NONE).save(buffer, 'PNG', optimize=True)
@@ -76,7 +76,7 @@ def _small(png: bytes, colours: int) -> bytes:
 
 
 def _figures(plan: Plan, outcomes: Outcomes) -> Iterator[tuple[str, Figure]]:
-    """Keys and figures of the experiment."""
+    """Yield keys and figures of the experiment."""
     shown = tuple(dict.fromkeys((HELD, 'knn', plan.default)))
     of = {
         s: {v: outcomes[c] for v, c in plan.paper_cases(s).items() if not outcomes[c].failed}
@@ -110,7 +110,7 @@ def _figures(plan: Plan, outcomes: Outcomes) -> Iterator[tuple[str, Figure]]:
 
 
 def cost_figure(costs: Mapping[str, Costs]) -> Figure:
-    """F and G of every round in percent of the first; a panel for each variant."""
+    """Plot F and G of every round in percent of the first, one panel per variant."""
     figure = new_figure(
         4.4 * len(costs), 4.6, 'Figure 1: relative cost at every iteration, fluoroscopic system 1'
     )
@@ -126,7 +126,7 @@ def cost_figure(costs: Mapping[str, Costs]) -> Figure:
 
 
 def total_cost_figure(costs: Mapping[str, Costs]) -> Figure:
-    """Mean of F and G of every round, one line for each variant."""
+    """Plot the mean of F and G of every round, one line per variant."""
     figure = new_figure(9, 4.4, 'Figure 2: weighted average of both costs, fluoroscopic system 1')
     axes = figure.subplots()
     for variant, (f, g) in costs.items():
@@ -151,7 +151,7 @@ def total_cost_figure(costs: Mapping[str, Costs]) -> Figure:
 
 
 def _percent(axes: Axes, values: Sequence[float]) -> None:
-    """Plain numbers on a logarithmic axis of percents."""
+    """Show plain numbers on a logarithmic axis of percentages."""
     shown = [v for v in values if v > 0]
     axes.set_ylim(0.8 * min(shown), 1.25 * max(shown))
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -165,7 +165,7 @@ def _percent(axes: Axes, values: Sequence[float]) -> None:
 
 
 def histogram_figure(residuals: Mapping[str, Residuals], system: str, axis: int) -> Figure:
-    """Histograms of the normalised residuals of a coordinate, with the standard normal."""
+    """Plot histograms of normalised residuals of a coordinate, with the standard normal."""
     number = (3 if system == '1' else 7) + axis
     figure = new_figure(
         3.5 * len(residuals),
@@ -214,7 +214,7 @@ def histogram_figure(residuals: Mapping[str, Residuals], system: str, axis: int)
 
 
 def position_figure(residuals: Mapping[str, Residuals], system: str, axis: int) -> Figure:
-    """Residuals of one coordinate over that coordinate; the first panel has its own scale."""
+    """Plot residuals of a coordinate against it; the first panel has its own scale."""
     number = (5 if system == '1' else 9) + axis
     figure = new_figure(
         3.6 * len(residuals),
@@ -245,7 +245,7 @@ def position_figure(residuals: Mapping[str, Residuals], system: str, axis: int) 
 
 
 def _scatter(axes: Axes, r: Residuals, axis: int, limit: float, colour: str) -> None:
-    """Dots of inliers, crosses of outliers (at the edge if beyond), and medians by stripes."""
+    """Plot inliers as dots, outliers as crosses (at the edge if beyond), and medians by stripe."""
     position = r.uv[:, axis]
     residual = r.residual[:, axis]
     axes.plot(
@@ -282,7 +282,7 @@ def _scatter(axes: Axes, r: Residuals, axis: int, limit: float, colour: str) -> 
 
 
 def map_figure(maps: Mapping[str, np.ndarray]) -> Figure:
-    """Error of the correction over the image, one panel per variant with a common scale."""
+    """Plot the error of the correction over the image, one panel per variant, common scale."""
     figure = new_figure(
         4.3 * len(maps) + 1,
         4.9,
@@ -319,7 +319,7 @@ def map_figure(maps: Mapping[str, np.ndarray]) -> Figure:
 
 
 def curve_figure(plan: Plan, outcomes: Outcomes) -> Figure:
-    """Accuracy of points, source and correction by the number of training exposures."""
+    """Plot the accuracy of points, source and correction by the number of training exposures."""
     figure = new_figure(
         14,
         5.2,
@@ -339,7 +339,7 @@ def curve_figure(plan: Plan, outcomes: Outcomes) -> Figure:
         }
         if (
             variant == plan.default
-        ):  # may lie on the line of the model that it chose: wider, and below it
+        ):  # may coincide with the line of the model that was selected: draw it wider and below
             look |= {'linewidth': 4, 'alpha': 0.4, 'markersize': 11, 'zorder': 1.5}
         for axes, values in zip(panels, curves(plan, outcomes, variant)):
             if np.isfinite(values).any():
@@ -365,7 +365,7 @@ def curve_figure(plan: Plan, outcomes: Outcomes) -> Figure:
 
 
 def curves(plan: Plan, outcomes: Outcomes, variant: str) -> np.ndarray:
-    """RMS over the rigs (3, counts) of object points [mm], source [mm], correction [px]."""
+    """Return RMS over the rigs (3, counts): object points [mm], source [mm], correction [px]."""
     cases = plan.curve_cases()
     out = np.full((3, len(plan.curve)), np.nan)
     for i, count in enumerate(plan.curve):

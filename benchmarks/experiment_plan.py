@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which cases the validation experiment consists of, and how they are run on two processes."""
+"""Cases of the validation experiment, and how they are run on two processes."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class Setting:
 class Plan:
     """Size of the experiment.
 
-    models that are compared and the default among them; relative: settings of the relative
-    orientation constraint; exposures of a recording, of which every so many are for the
-    calibration; curve: counts of training exposures, with curve_seeds; seeds of the rigs of the
-    comparison under settings; joint_seeds of that of joint with separate calibration; rounds:
-    largest number of them in a calibration; paper_survey: factor of the stated standard deviation
-    of the survey in the paper's tables.
+    models: compared models; default: the default among them; relative: settings of the relative
+    orientation constraint; exposures: number in a recording; every: step between those for the
+    calibration; curve: counts of training exposures, with curve_seeds; seeds: rigs of the
+    comparison under settings; joint_seeds: rigs of the comparison of joint and separate
+    calibration; rounds: maximum number; paper_survey: factor on the stated standard deviation of
+    the survey in the paper's tables.
     """
 
     models: tuple[str, ...]
@@ -81,7 +81,7 @@ class Plan:
         training: int | None = None,
         **more: Any,
     ) -> Case:
-        """A case of this size."""
+        """Return a case of this size."""
         training = None if training == self.trained else training
         return Case(
             seed,
@@ -95,11 +95,11 @@ class Plan:
         )
 
     def paper_variants(self) -> tuple[str, ...]:
-        """Variants of the paper's tables and beyond, in order."""
+        """Variants of the paper's tables and additional ones, in order."""
         return (BEFORE, HELD, *self.models, KNOWN)
 
     def paper_cases(self, system: str) -> dict[str, Case]:
-        """Cases by variant of system 'a', 'b' or 'a+b' (joint)."""
+        """Return cases by variant of system 'a', 'b' or 'a+b' (joint)."""
         names = tuple(system.split('+'))
         return {
             v: self.case(
@@ -114,7 +114,7 @@ class Plan:
         }
 
     def cost_cases(self) -> dict[str, Case]:
-        """Cases of system 1 whose rounds are shown, by variant.
+        """Return the cases of system 1 whose rounds are shown, by variant.
 
         The survey has full weight: with a low weight, C_r of a bead seen once or twice is nearly
         singular, and these few beads dominate G.
@@ -125,7 +125,7 @@ class Plan:
         }
 
     def curve_cases(self) -> dict[tuple[str, int, int], Case]:
-        """Cases by variant, count of training exposures and seed."""
+        """Return cases by variant, count of training exposures and seed."""
         return {
             (v, count, seed): self.case(seed, v, training=count)
             for v in (*self.models, KNOWN)
@@ -134,7 +134,7 @@ class Plan:
         }
 
     def setting_cases(self, setting: Setting) -> dict[tuple[str, int], Case]:
-        """Cases by variant and seed."""
+        """Return cases by variant and seed."""
         return {
             (v, seed): self.case(
                 seed,
@@ -148,7 +148,7 @@ class Plan:
         }
 
     def joint_cases(self) -> dict[tuple[str, int], Case]:
-        """Cases of the default model by label and seed."""
+        """Return cases of the default model by label and seed."""
         kinds: dict[str, dict[str, Any]] = {'separate': {}, 'joint': {'joint': True}}
         kinds.update(
             {
@@ -163,18 +163,18 @@ class Plan:
         }
 
     def cases(self) -> list[Case]:
-        """All cases, each once."""
+        """Return all cases without duplicates."""
         listed = [c for system in ('a', 'b', 'a+b') for c in self.paper_cases(system).values()]
         listed += self.cost_cases().values()
         listed += self.curve_cases().values()
         listed += self.joint_cases().values()
         for setting in self.settings:
             listed += self.setting_cases(setting).values()
-        return list(dict.fromkeys(listed))  # the first of equals has its details
+        return list(dict.fromkeys(listed))  # of equal cases, the first one has the details
 
 
 def full_plan() -> Plan:
-    """The experiment of docs/how_good/accuracy.md."""
+    """Return the experiment of docs/how_good/accuracy.md."""
     return Plan(
         available_models(),
         CalibrationOptions().model,
@@ -195,15 +195,15 @@ def full_plan() -> Plan:
             ),
         ),
         60,
-        # The paper defined its datum by surveyed coordinates with a low weight. A survey with full
-        # weight would fix the object points before any calibration, and hide most of the
+        # The paper defined its datum by surveyed coordinates with a low weight. With full weight,
+        # the survey would fix the object points before any calibration and hide most of the
         # improvement.
         20.0,
     )
 
 
 def quick_plan() -> Plan:
-    """A small plan with every section; its numbers mean little."""
+    """Return a small plan with every section; its numbers are not meaningful."""
     default = CalibrationOptions().model
     hard = Setting(
         '5 exposures, double distortion, 5 % false matches', strength=2.0, false_matches=0.05
@@ -229,13 +229,13 @@ def quick_plan() -> Plan:
 
 
 def run(cases: Sequence[Case], processes: int = PROCESSES) -> Outcomes:
-    """Outcomes by case. Cases of one recording run in one process, the longest groups first."""
+    """Return outcomes by case. Run cases of one recording in one process, largest groups first."""
     groups = defaultdict(list)
     for case in cases:
         groups[case.scene, case.fluoroscopes].append(case)
     ordered = sorted(groups.values(), key=lambda group: -sum(map(_effort, group)))
     for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
-        os.environ[name] = '1'  # for the processes that are started below
+        os.environ[name] = '1'  # inherited by the worker processes started below
     out: Outcomes = {}
     began = time.monotonic()
     with ProcessPoolExecutor(processes, multiprocessing.get_context('spawn')) as pool:
@@ -250,7 +250,7 @@ def run(cases: Sequence[Case], processes: int = PROCESSES) -> Outcomes:
 
 
 def _run_group(group: Sequence[Case]) -> list[Outcome]:
-    """Outcomes of cases, each reported on standard error."""
+    """Run cases and return their outcomes, reporting each on standard error."""
     outcomes = []
     for case in group:
         began = time.perf_counter()
@@ -268,6 +268,6 @@ def _run_group(group: Sequence[Case]) -> list[Outcome]:
 
 
 def _effort(case: Case) -> float:
-    """Time of a case, roughly, in units of one fluoroscope with 15 exposures."""
+    """Return the approximate time of a case, relative to one fluoroscope with 15 exposures."""
     size = len(case.fluoroscopes)
     return size * size + size * (case.training or case.exposures / case.every) / 15

@@ -1,7 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables of the validation experiment: Tables 1-9 of Chow et al. with our rows, and more."""
+"""Tables of the validation experiment: Tables 1-9 of Chow et al.
+
+with our rows, and further ones.
+"""
 
 from __future__ import annotations
 
@@ -67,12 +70,12 @@ NAMES = {
 
 
 def label_of(variant: str) -> str:
-    """First cell of one of our rows."""
+    """Return the first cell of one of our rows."""
     return NAMES.get(variant, f'ours: {variant}')
 
 
 def gains(values: Iterable[float], first: Iterable[float]) -> list[str]:
-    """Improvements [%] over the row `before`, as text."""
+    """Return the improvements [%] over the row `before` as text."""
     return [f'{100 * (1 - v / b):.1f}' for v, b in zip(values, first)]
 
 
@@ -107,7 +110,7 @@ def object_table(
 
 
 def reprojection_table(outcomes: Mapping[str, Outcome], paper: Sequence[Sequence[float]]) -> str:
-    """Tables 1, 4, 7: cost and RMSE of the in-sample residuals."""
+    """Return Tables 1, 4, 7: cost and RMSE of the in-sample residuals."""
     header = [
         '',
         'cost',
@@ -155,7 +158,7 @@ def reprojection_table(outcomes: Mapping[str, Outcome], paper: Sequence[Sequence
 
 
 def reprojection(outcome: Outcome) -> list[float]:
-    """Cost, reweighted RMSE x, y and raw RMSE x, y [px] of all fluoroscopes of an outcome."""
+    """Return cost, reweighted and raw RMSE x, y [px] of all fluoroscopes of an outcome."""
     residuals = list(outcome.residuals.values())
     both = residuals[0]
     for more in residuals[1:]:
@@ -168,7 +171,7 @@ def reprojection(outcome: Outcome) -> list[float]:
 
 
 def curve_table(plan: Plan, outcomes: Outcomes, which: int, digits: int) -> str:
-    """A quantity by variant and number of training exposures.
+    """Tabulate a quantity by variant and number of training exposures.
 
     which: 0 points, 1 source, 2 correction.
     """
@@ -180,7 +183,7 @@ def curve_table(plan: Plan, outcomes: Outcomes, which: int, digits: int) -> str:
 
 
 class Comparison:
-    """Results of a comparison over several rigs, by variant; failed cases are left out."""
+    """Results of a comparison over several rigs, by variant; failed cases are excluded."""
 
     def __init__(self, plan: Plan, outcomes: Outcomes, setting: Setting) -> None:
         self._outcomes = {key: outcomes[case] for key, case in plan.setting_cases(setting).items()}
@@ -191,13 +194,13 @@ class Comparison:
         return self._outcomes[key]
 
     def seeds(self, variant: str) -> list[int]:
-        """Seeds for which neither this variant nor known distortion failed."""
+        """Return the seeds for which neither this variant nor known distortion failed."""
         return [
             s for s in self.plan.seeds if not (self[variant, s].failed or self[KNOWN, s].failed)
         ]
 
     def rms(self, variant: str, figure: str) -> float:
-        """Root mean square over the rigs of a method of Outcome."""
+        """Return the root mean square over the rigs of the result of a method of Outcome."""
         return float(
             np.sqrt(
                 np.mean([getattr(self[variant, s], figure)() ** 2 for s in self.seeds(variant)])
@@ -205,7 +208,7 @@ class Comparison:
         )
 
     def ratios(self, variant: str, figure: str = 'points_mm') -> np.ndarray:
-        """Ratios to known distortion, one for each rig."""
+        """Return the ratios to known distortion, one per rig."""
         return np.array(
             [
                 getattr(self[variant, s], figure)() / getattr(self[KNOWN, s], figure)()
@@ -214,9 +217,9 @@ class Comparison:
         )
 
     def image_px(self, variant: str, within: str | None = None) -> float:
-        """RMSE [px] of the correction, RMS over the rigs.
+        """Return the RMSE [px] of the correction, as RMS over the rigs.
 
-        within: variant to whose calibrated area it is restricted.
+        within: variant whose calibrated area restricts the evaluation.
         """
         return float(
             np.sqrt(
@@ -236,7 +239,7 @@ class Comparison:
         )
 
     def table(self) -> str:
-        """Means over the rigs, a row for each variant."""
+        """Return a table of means over the rigs, one row per variant."""
         header = [
             'model',
             'points 3-D [mm]',
@@ -287,7 +290,7 @@ class Comparison:
         ]
 
     def by_rig(self) -> str:
-        """Ratio to known distortion for each rig and model, and what the default chose."""
+        """Tabulate ratios to known distortion by rig and model, and the default's choice."""
         rows = []
         for s in self.plan.seeds:
             row = [str(s), '-' if self[KNOWN, s].failed else f'{self[KNOWN, s].points_mm():.4f}']
@@ -304,7 +307,7 @@ class Comparison:
 
 
 def chosen(outcome: Outcome) -> str:
-    """Kind, k and rounds of a calibration, in words."""
+    """Describe kind, k and rounds of a calibration in words."""
     if outcome.failed:
         return 'failed'
     kinds = ', '.join(
@@ -314,7 +317,7 @@ def chosen(outcome: Outcome) -> str:
 
 
 def joint_table(plan: Plan, outcomes: Outcomes) -> str:
-    """Separate and joint calibration with the same test; gains over separate in percent."""
+    """Compare separate and joint calibration in one test; gains over separate in percent."""
     cases = plan.joint_cases()
     rows = []
     base = None
@@ -351,7 +354,7 @@ def joint_table(plan: Plan, outcomes: Outcomes) -> str:
 
 
 def joint_figures(found: Sequence[Outcome]) -> tuple[float, float, float, float]:
-    """RMS over the rigs of points 3-D, source 3-D [mm] and correction [px]; mean time [s]."""
+    """Return RMS over the rigs of 3-D points, source [mm] and correction [px]; mean time [s]."""
 
     def rms(values: Sequence[float]) -> float:
         return float(np.sqrt(np.mean(np.square(values))))

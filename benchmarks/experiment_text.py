@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text of docs/how_good/accuracy.md: experiment, results, and the shortcomings they show."""
+"""Text of docs/how_good/accuracy.md: experiment, results, and the shortcomings they reveal."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from .experiment_tables import (
     reprojection_table,
 )
 
-Paths = Mapping[str, str]  # of the pictures, by key
+Paths = Mapping[str, str]  # paths of the pictures, by key
 
-AIM = 1.04  # 3-D RMSE of object points over that of perfectly known distortion, 15 exposures
+AIM = 1.04  # target 3-D RMSE of object points relative to exactly known distortion, 15 exposures
 SYSTEMS = {
     'a': 'fluoroscopic system 1',
     'b': 'fluoroscopic system 2',
@@ -90,7 +90,7 @@ FIGURE_TEXT = {
 
 
 def picture(paths: Paths, key: str, document: Path, caption: str) -> str:
-    """Markdown of a picture with its caption."""
+    """Return the Markdown of a picture with its caption."""
     if key not in paths:
         return ''
     link = os.path.relpath(paths[key], document.parent).replace(os.sep, '/')
@@ -102,7 +102,7 @@ def picture(paths: Paths, key: str, document: Path, caption: str) -> str:
 
 
 def paper_section(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) -> str:
-    """Figures 1-10 and Tables 1-9."""
+    """Return Figures 1-10 and Tables 1-9."""
     datum = (
         ''
         if plan.paper_survey == 1
@@ -137,7 +137,7 @@ def paper_section(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) 
 
 
 def tables_of(plan: Plan, outcomes: Outcomes, system: str, first: int) -> list[str]:
-    """Three tables of a system, numbered as in the paper."""
+    """Return the three tables of a system, numbered as in the paper."""
     of = {v: outcomes[c] for v, c in plan.paper_cases(system).items()}
     name = SYSTEMS[system]
     return [
@@ -158,7 +158,7 @@ def tables_of(plan: Plan, outcomes: Outcomes, system: str, first: int) -> list[s
 
 
 def convergence(plan: Plan, outcomes: Outcomes) -> str:
-    """Number of rounds of each calibration of system 1."""
+    """Report the number of rounds of each calibration of system 1."""
     of = {v: outcomes[c] for v, c in plan.cost_cases().items()}
     said = [
         f'{v}: {o.rounds} rounds, {o.seconds:.1f} s{"" if o.converged else " (not converged)"}'
@@ -176,7 +176,7 @@ def convergence(plan: Plan, outcomes: Outcomes) -> str:
 
 
 def curve_section(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) -> str:
-    """Accuracy as a function of the number of training exposures."""
+    """Report accuracy as a function of the number of training exposures."""
     tested = plan.exposures - plan.trained
     rigs = f'rig{"s" * (len(plan.curve_seeds) > 1)} {", ".join(map(str, plan.curve_seeds))}'
     return '\n'.join(
@@ -205,7 +205,7 @@ def curve_section(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) 
 
 
 def rigs_section(comparisons: Sequence[Comparison], paths: Paths, document: Path) -> str:
-    """Comparison of the models over several rigs."""
+    """Compare the models over several rigs."""
     plan = comparisons[0].plan
     parts = [
         f'## 3. Comparison over {len(plan.seeds)} rigs\n',
@@ -247,7 +247,7 @@ def joint_section(plan: Plan, outcomes: Outcomes) -> str:
 
 
 def summary_section(plan: Plan, comparisons: Sequence[Comparison]) -> str:
-    """The main results."""
+    """Summarise the main results."""
     lines = ['## Summary\n']
     for c in comparisons:
         if not c.seeds(plan.default):
@@ -280,7 +280,7 @@ def summary_section(plan: Plan, comparisons: Sequence[Comparison]) -> str:
 
 
 def shortcomings(plan: Plan, outcomes: Outcomes, comparisons: Sequence[Comparison]) -> list[str]:
-    """Sentences on missed aims and other shortcomings, derived from the results."""
+    """Return sentences on missed aims and other shortcomings, derived from the results."""
     return [
         *_of_settings(plan, comparisons),
         *_of_paper(plan, outcomes),
@@ -412,7 +412,7 @@ def _named(case: Case) -> str:
 
 
 def document_text(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) -> str:
-    """The whole text of docs/how_good/accuracy.md."""
+    """Return the whole text of docs/how_good/accuracy.md."""
     comparisons = [Comparison(plan, outcomes, setting) for setting in plan.settings]
     models = ''.join(
         f'| `{m}` | {ABOUT.get(m, "a model of this package")} |\n'

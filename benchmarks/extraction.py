@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Extraction of beads from radiographs: found, precise, honest, never wrong.
+"""Extraction of beads from radiographs: completeness, precision, claimed sd and false ids.
 
     python -m benchmarks.extraction --images 100        all sets of images, printed as tables of
                                                         docs/how_good.md
@@ -10,9 +10,9 @@
     python -m benchmarks.extraction --picture PATH      an image with its overlay
 
 The settings of the renderer (bead, blur, glare, field, polarity, distortion) are drawn anew for
-every image. The images of the set `followed` are clean, and each follows one in which the phantom
-was turned by a degree. The Cramer-Rao bound is that of the rendered light: its derivative by the
-place of a bead, against the variance of photons, for beads that stand alone.
+every image. The images of the set `followed` are clean, and each follows one with the phantom
+rotated by one degree. The Cramer-Rao bound is that of the rendered light: its derivative with
+respect to the position of a bead, relative to the photon variance, for isolated beads.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ from fluoro_calib_ros.simulation.rig import (
     virtual_rig,
 )
 
-FIRST_RIG = 1000  # seeds below are those of development and tests
+FIRST_RIG = 1000  # smaller seeds are used in development and tests
 IMAGES_OF_A_RIG = 5
-BOUND_IMAGES = 12  # of a set, for which the bound is computed
+BOUND_IMAGES = 12  # images of a set for which the bound is computed
 FALSE_PX = 1.0
-UNSEEN = 8  # exposures that test a calibration
-PLAIN = 0.3  # of the noise, to which a plain background is a polynomial
+UNSEEN = 8  # exposures for the test of a calibration
+PLAIN = 0.3  # deviation of a plain background from a polynomial, relative to the noise
 SIZE = (1024, 1024)
 SETS = ('clean', 'hard', 'followed')
-TURN = Rotation.from_euler('z', 1, degrees=True).as_matrix()  # since the image that is followed
-KINDS = ('turntable', 'any', 'tube', 'other')  # of poses; other: of another phantom
+TURN = Rotation.from_euler('z', 1, degrees=True).as_matrix()  # since the followed image
+KINDS = ('turntable', 'any', 'tube', 'other')  # kinds of poses; 'other': pose of another phantom
 
 
 def settings_of(rng: np.random.Generator, hard: bool) -> RadiographSettings:
-    """Draw the settings of an image."""
+    """Draw random settings of an image."""
     base = HARD if hard else CLEAN
     return replace(
         base,
@@ -77,10 +77,10 @@ def settings_of(rng: np.random.Generator, hard: bool) -> RadiographSettings:
 def bound(
     radiography: Radiography, rig: VirtualRig, pose: Pose, seed: int, centres: np.ndarray
 ) -> np.ndarray:
-    """Cramer-Rao bounds (n,) of a coordinate [px] of beads that stand alone at centres (n, 2).
+    """Return Cramer-Rao bounds (n,) of a coordinate [px] of isolated beads at centres (n, 2).
 
-    NaN where the background is not plain: where a polynomial of degree 2 does not describe it
-    within a part of the noise.
+    A bound is NaN where the background is not plain, that is, where a polynomial of degree 2 does
+    not fit it within a fraction of the noise.
     """
     light = radiography.light(rig.true_mm, pose, seed)
     without = radiography.light(rig.true_mm[:0], pose, seed)
@@ -94,7 +94,7 @@ def bound(
             continue
         if _roughness(without[part]) > PLAIN * np.sqrt(np.mean(variance[part])):
             continue
-        # Slopes of the background are not those of the shadow.
+        # Do not count background slopes as information of the shadow.
         information = [
             np.sum((slope[part] - np.median(slope[part])) ** 2 / variance[part])
             for slope in (by_u, by_v)
@@ -104,7 +104,7 @@ def bound(
 
 
 def _roughness(background: np.ndarray) -> float:
-    """Root mean square of what a polynomial of degree 2 leaves of a window (k, k)."""
+    """Return the RMS residual of a degree-2 polynomial fitted to a window (k, k)."""
     y, x = np.indices(background.shape) / len(background) - 0.5
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
     values = background.reshape(-1).astype(float)
@@ -113,7 +113,7 @@ def _roughness(background: np.ndarray) -> float:
 
 
 def measure_set(count: int, name: str, report: Callable[[str], None]) -> dict[str, Any]:
-    """Extract a set of images and compare them with the truth."""
+    """Extract beads from a set of images and compare them with the truth."""
     hard = name == 'hard'
     records: dict[str, list[Any]] = {
         key: []
@@ -171,7 +171,7 @@ def measure_set(count: int, name: str, report: Callable[[str], None]) -> dict[st
 
 
 def summary(records: dict[str, list[Any]], false_of: list[float]) -> dict[str, Any]:
-    """Figures of a set."""
+    """Return summary figures of a set."""
     error, sigma, overlapped, free, limit = (
         np.concatenate(records[key]) for key in ('error', 'sigma', 'overlapped', 'free', 'bound')
     )
@@ -207,12 +207,12 @@ def summary(records: dict[str, list[Any]], false_of: list[float]) -> dict[str, A
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def robust(values: np.ndarray) -> float:
-    """Standard deviation by the median of absolute values."""
+    """Return the standard deviation estimated from the median of absolute values."""
     return float(np.median(np.abs(values)) / 0.6745)
 
 
@@ -230,7 +230,7 @@ def pose_of(kind: str, rng: np.random.Generator, fluoroscope: VirtualFluoroscope
 
 
 def seen_points(rng: np.random.Generator, observed: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Points (n, 2) as they are found: merged where close, some missed, some that are no bead."""
+    """Return points (n, 2) as detected: close ones merged, some missing, some spurious."""
     inside = points_on_image(observed, SIZE)
     inside[inside] = field[tuple(np.rint(observed[inside]).astype(int).T[::-1])]
     uv = observed[inside] + rng.normal(0, 0.15, (inside.sum(), 2))
@@ -245,7 +245,7 @@ def seen_points(rng: np.random.Generator, observed: np.ndarray, field: np.ndarra
 
 
 def measure_points(count: int, kind: str, report: Callable[[str], None]) -> dict[str, Any]:
-    """Match points of drawn poses; kind also 'other': a phantom that is not in the image."""
+    """Match points of random poses; kind 'other': a phantom that is not in the image."""
     y, x = np.mgrid[:1024, :1024]
     field = np.hypot(x - 511.5, y - 511.5) < 490
     wrong = 0
@@ -286,7 +286,7 @@ def measure_points(count: int, kind: str, report: Callable[[str], None]) -> dict
 
 
 def phantoms(rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Beads (n, 3) [mm] of phantoms that are regular or nearly so."""
+    """Return beads (n, 3) [mm] of regular or nearly regular phantoms."""
     axis = np.arange(4) * 40.0 - 60
     cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     side = np.arange(21) * 10.0 - 100
@@ -305,7 +305,7 @@ def phantoms(rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 def measure_phantoms(count: int, report: Callable[[str], None]) -> dict[str, dict[str, Any]]:
-    """Match points of other phantoms: cubes from anywhere, flat grids within some 30 degrees."""
+    """Match points of other phantoms: cubes from anywhere, flat grids within about 30 degrees."""
     y, x = np.mgrid[:1024, :1024]
     field = np.hypot(x - 511.5, y - 511.5) < 490
     tables: dict[str, dict[str, Any]] = {}
@@ -348,8 +348,8 @@ def measure_phantoms(count: int, report: Callable[[str], None]) -> dict[str, dic
 def measure_calibration(count: int, report: Callable[[str], None]) -> dict[str, Any]:
     """Calibrate from images and from true centres, and compare points in space and sources.
 
-    Both calibrations are held while radiographs that they have not seen are adjusted, and while
-    the true centres of the same beads are.
+    Both calibrations are fixed in the adjustments of unseen radiographs and of the true centres of
+    the same beads.
     """
     rig = virtual_rig(FIRST_RIG + 9000)
     rng = np.random.default_rng(91)
@@ -370,7 +370,7 @@ def measure_calibration(count: int, report: Callable[[str], None]) -> dict[str, 
 def _extracted(
     rig: VirtualRig, poses: list[Pose], first: int, report: Callable[[str], None]
 ) -> tuple[dict[str, list[Frame]], dict[str, list[Frame]]]:
-    """Frames of rendered radiographs, and the same with the true centres."""
+    """Return frames of rendered radiographs, and the same frames with the true centres."""
     extracted: dict[str, list[Frame]] = {}
     ideal: dict[str, list[Frame]] = {}
     model = PhantomModel.of(rig.phantom.xyz_mm)
@@ -393,7 +393,7 @@ def _extracted(
 def errors_in_space(
     frames: dict[str, list[Frame]], calibrations: Any, rig: VirtualRig, poses: list[Pose]
 ) -> dict[str, float]:
-    """RMSE of object points and sources [mm], adjusted with calibrations held."""
+    """Return the RMSE of object points and sources [mm], adjusted with fixed calibrations."""
     phantom = Phantom(rig.phantom.target_id, rig.phantom.xyz_mm, rig.phantom.sd_mm)
     result = adjust(frames, phantom, calibrations)
     row = rig.phantom.index(result.targets.target_id)
@@ -410,7 +410,7 @@ def errors_in_space(
 
 
 def write_picture(path: Path) -> None:
-    """Write a part of a hard image, and of its overlay beside it."""
+    """Write a part of a hard image next to the same part of its overlay."""
     rig = virtual_rig(5)
     radiography = Radiography(rig.fluoroscopes[0], HARD)
     image = radiography.image(rig.true_mm, phantom_poses(np.random.default_rng(3), 4)[1], 1)

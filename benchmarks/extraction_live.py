@@ -6,15 +6,15 @@
 Radiographs of a virtual rig go through the nodes: extraction, calibration, correction,
 reconstruction. First the observations and the calibration are compared with those of the jobs
 behind the commands extract and calibrate. Then the latency from two images to their points, and
-the rate, are measured: for a phantom in ever other poses, for one that moves slowly and is
-followed, for one that is filmed at 30 Hz, and for 30 markers that are filmed so.
+the rate are measured for a phantom in a new pose each time, for one that moves slowly and is
+followed, for one that is filmed at 30 Hz, and for 30 markers filmed at this rate.
 
 `--chain SECONDS` measures the chain from images to poses instead: 30 markers in five bodies, two
-views of 1024 x 1024 px and 8 bits at 30 Hz, whose images another process plays from a bag; with
-`--times N` so many times, forth and back.
-Nothing but bodies.csv and the calibrations is given. It prints lost exposures, latency, and CPU
-time of each process; with `--parts`, what the milliseconds of an exposure are spent on. `--folder`
-keeps what is rendered. The profile for large messages is used with
+views of 1024 x 1024 px and 8 bits at 30 Hz, whose images another process plays from a bag, with
+`--times N` N times forwards and backwards.
+The only inputs are bodies.csv and the calibrations. The output is lost exposures, latency, and CPU
+time of each process; with `--parts`, how the milliseconds of an exposure are spent. `--folder`
+keeps the rendered data. The profile for large messages is used with
 `FASTRTPS_DEFAULT_PROFILES_FILE=config/large_images.xml`.
 """
 
@@ -106,27 +106,27 @@ from fluoro_calib_ros.simulation.rig import (
 NAMES = ('a', 'b')
 SEED = 31
 MODEL = 'local_linear'
-TURN_RAD = np.deg2rad(1.0)  # of the phantom from image to image
+TURN_RAD = np.deg2rad(1.0)  # rotation of the phantom between images
 SHIFT_MM = 1.0
 FILM_HZ = 30.0
 FIRST_NS = 1_700_000_000_000_000_000
 EXPOSURE_NS = 500_000_000
 SHAPE_SD_MM = 0.05
 WRONG_PX = 1.5
-SETTLING_S = 2.0  # in which a node discovers the camera, too
+SETTLING_S = 2.0  # time in which a node also discovers the camera
 
 Images = Sequence[Mapping[str, np.ndarray]]
 
 
 @dataclass
 class Latencies:
-    """Exposures that were published, and when the points of some came [s]."""
+    """Stamps of published exposures, and arrival times of the points of some of them [s]."""
 
     published: dict[int, float] = field(default_factory=dict)
     came: dict[int, float] = field(default_factory=dict)
 
     def text(self) -> str:
-        """Return rate and latencies in words."""
+        """Return rate and latencies as text."""
         seconds = [self.came[s] - self.published[s] for s in self.came if s in self.published]
         if len(seconds) < 2:
             return 'no points'
@@ -140,13 +140,13 @@ class Latencies:
 
 
 class Camera(Node):
-    """Publishes images and hears what comes of them."""
+    """Publishes images and collects the resulting messages."""
 
     def __init__(self) -> None:
         super().__init__('camera')
         self.observed: dict[tuple[str, int], TargetObservations] = {}
         self.exposures: dict[str, int] = {}
-        self.points: dict[int, int] = {}  # number of points by stamp
+        self.points: dict[int, int] = {}  # number of points, by stamp
         self.latencies = Latencies()
         self.extraction: dict[str, dict[str, str]] = {}
         self.orientations: list[RigOrientation] = []
@@ -191,7 +191,7 @@ class Camera(Node):
                 self.extraction[status.hardware_id] = values
 
     def wait(self, condition: Any, seconds: float = 600.0) -> bool:
-        """Spin until a condition holds; returns whether it does."""
+        """Spin until a condition holds; return whether it does."""
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
@@ -200,13 +200,13 @@ class Camera(Node):
         return True
 
     def ready(self) -> bool:
-        """Return whether the nodes receive images, and are known."""
+        """Return whether the nodes receive images and have been discovered."""
         return bool(self.exposures) and all(
             output.get_subscription_count() for output in self._images.values()
         )
 
     def publish(self, images: Mapping[str, np.ndarray], interval_ns: int = EXPOSURE_NS) -> int:
-        """Publish the images of an exposure; returns its stamp."""
+        """Publish the images of an exposure; return its stamp."""
         self._stamp_ns += interval_ns
         self.latencies.published[self._stamp_ns] = time.monotonic()
         for name, image in images.items():
@@ -219,7 +219,7 @@ class Camera(Node):
     def show(self, images: Mapping[str, np.ndarray], number: int) -> None:
         """Publish the images of an exposure until both are extracted.
 
-        A busy machine may lose images between writer and reader.
+        A busy machine may lose images between publisher and subscriber.
         """
         interval_ns = EXPOSURE_NS
         missing = dict(images)
@@ -235,7 +235,7 @@ class Camera(Node):
 
 
 def rendered(rig: VirtualRig, poses: Sequence[Pose]) -> Images:
-    """Take radiographs of the phantom in poses."""
+    """Render radiographs of the phantom in given poses."""
     renderers = Renderers(rig.fluoroscopes, SETTINGS['clean'])
     try:
         return [
@@ -247,7 +247,7 @@ def rendered(rig: VirtualRig, poses: Sequence[Pose]) -> Images:
 
 
 def moving(start: Pose, count: int) -> list[Pose]:
-    """Poses of a phantom that turns and goes."""
+    """Return poses of a phantom that rotates and translates."""
     return [
         (
             matrix_from_vector([0, 0, TURN_RAD * number]) @ start[0],
@@ -258,7 +258,7 @@ def moving(start: Pose, count: int) -> list[Pose]:
 
 
 def by_command(images: Images, rig: VirtualRig, folder: Path) -> dict[str, list[Frame]]:
-    """Extract images as the command does, from files."""
+    """Extract from image files as the command does."""
     frames = {}
     for name in NAMES:
         (folder / name).mkdir()
@@ -271,7 +271,7 @@ def by_command(images: Images, rig: VirtualRig, folder: Path) -> dict[str, list[
 
 
 def compare(camera: Camera, frames: Mapping[str, Sequence[Frame]], rig: VirtualRig) -> None:
-    """Print how observations and calibrations differ between nodes and command."""
+    """Print the differences of observations and calibrations between nodes and command."""
     same = 0
     largest = 0.0
     count = 0
@@ -307,7 +307,7 @@ def compare(camera: Camera, frames: Mapping[str, Sequence[Frame]], rig: VirtualR
 
 
 def measure_one_by_one(camera: Camera, images: Images, what: str) -> None:
-    """Publish each exposure when the points of the one before have come, and print."""
+    """Publish each exposure after the points of the previous one have arrived; print results."""
     camera.latencies = Latencies()
     for of_exposure in images:
         stamp = camera.publish(of_exposure)
@@ -316,7 +316,7 @@ def measure_one_by_one(camera: Camera, images: Images, what: str) -> None:
 
 
 def measure_film(camera: Camera, images: Images, seconds: float, what: str) -> None:
-    """Publish exposures at the rate of a camera, forth and back, and print."""
+    """Publish exposures at the rate of a camera, forwards and backwards; print results."""
     camera.latencies = Latencies()
     there_and_back = [*images, *reversed(images)]
     start = time.monotonic()
@@ -339,7 +339,7 @@ def measure_stream(
     extraction: Mapping[str, Any],
     shown: tuple[Images, float, str],
 ) -> None:
-    """Start nodes with the saved calibrations and the shortest queue, and film.
+    """Start nodes with the saved calibrations and the shortest queue, and publish a film.
 
     Parameters
     ----------
@@ -368,7 +368,7 @@ def measure_stream(
 
 
 def moving_markers(rig: VirtualRig, count: int) -> tuple[Images, dict[str, list[Frame]]]:
-    """Return radiographs of markers in motion, and where they are in the first ones."""
+    """Return radiographs of moving markers, and the initial positions of the markers."""
     sequence = MarkerSequence(
         rig, MovingMarkers(MarkerScene(hidden=0.0), SEED), MARKER_SETTINGS, count, SEED
     )
@@ -408,7 +408,7 @@ def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
         print(f'{exposures} exposures extracted and collected in {time.monotonic() - start:.1f} s')
         compare(camera, frames, rig)
         camera.wait(lambda: camera.orientations)
-        camera.wait(lambda: False, 3)  # the reconstruction takes the orientation
+        camera.wait(lambda: False, 3)  # time for the reconstruction to take up the orientation
         measure_one_by_one(camera, still[:8], 'other poses')
         measure_one_by_one(camera, film, 'slow motion')
         extraction.terminate()
@@ -428,11 +428,11 @@ def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
 CHAIN_SEED = 310
 CHAIN_SETTINGS = replace(MARKER_SETTINGS, bits=8)
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
-STAMP_AT = 4  # byte of the stamp in a serialized Image
-WARM_UP_S = 3.0  # at the beginning of the bag, in which the bodies are identified; not counted
-PLAYED = 'played.npy'  # stamps of the exposures that were played
+STAMP_AT = 4  # byte offset of the stamp in a serialized Image
+WARM_UP_S = 3.0  # start of the bag, in which bodies are identified; excluded from the results
+PLAYED = 'played.npy'  # stamps of the published exposures
 TICKS = os.sysconf('SC_CLK_TCK')
-# What an exposure of two images is spent on in the process that follows markers.
+# Steps of the processing of an exposure of two images in the process that follows markers.
 PARTS: dict[str, tuple[tuple[type, str], ...]] = {
     'predict': ((MarkerStates, 'advance'), (JoinedViews, '_suggest')),
     'search': ((MarkerSearch, 'shadows'), (JoinedViews, '_search')),
@@ -451,7 +451,7 @@ PARTS: dict[str, tuple[tuple[type, str], ...]] = {
 
 
 def write_chain(folder: Path, exposures: int, rate_hz: float = FILM_HZ) -> None:
-    """Write calibration, bodies.csv and a bag of images of moving bodies, and the truth."""
+    """Write calibration, bodies.csv, the truth, and a bag of images of moving bodies."""
     rig = virtual_rig(CHAIN_SEED)
     outcome = calibrate(simulate_exposures(rig, 15, CHAIN_SEED).frames, rig.phantom, joint=True)
     save_outcome(folder / 'calibration', outcome)
@@ -476,7 +476,7 @@ def write_chain(folder: Path, exposures: int, rate_hz: float = FILM_HZ) -> None:
 
 
 class BagCamera(Node):
-    """Publishes the images of a bag at their times, with the time of publication as stamp."""
+    """Publishes the images of a bag at their times, stamped with the time of publication."""
 
     def __init__(self, bag: Path, times: int) -> None:
         super().__init__('bag_camera')
@@ -502,18 +502,18 @@ class BagCamera(Node):
 
 
 def _row(number: int, count: int) -> int:
-    """Row of an exposure in a bag of so many that is played forth and back."""
+    """Return the row of an exposure in a bag of `count` that is played forwards and backwards."""
     return min(number % (2 * count), -1 - number % (2 * count) + 2 * count)
 
 
 class ChainReader(Node):
-    """Notes when what follows from the images was published, by the stamp of the images [ns]."""
+    """Records the publication time of each output, by the stamp of the images [ns]."""
 
     def __init__(self) -> None:
         super().__init__('chain_reader')
         self.came: dict[str, dict[int, int]] = {}
         self.observed: dict[str, list[TargetObservations]] = {name: [] for name in NAMES}
-        self.tracked: dict[int, int] = {}  # bodies with a pose, by stamp
+        self.tracked: dict[int, int] = {}  # number of bodies with a pose, by stamp
         for name in NAMES:
             self._listen(TargetObservations, f'{name}/target_observations')
             self._listen(CorrectedObservations, f'{name}/corrected_observations')
@@ -527,7 +527,7 @@ class ChainReader(Node):
 
         def note(message: Any, info: Mapping[str, int]) -> None:
             stamp = nanoseconds_from_stamp(message.header.stamp)
-            came.setdefault(stamp, info['source_timestamp'])  # poses come again if taken back
+            came.setdefault(stamp, info['source_timestamp'])  # retracted poses are published again
             if kind is TargetObservations:
                 self.observed[topic.partition('/')[0]].append(message)
             if kind is BodyPoses:
@@ -543,13 +543,13 @@ class ChainReader(Node):
 
 
 def cpu_seconds(pid: int) -> float:
-    """CPU time [s] that a process has used, all its threads together."""
+    """Return the CPU time [s] that a process has used, summed over its threads."""
     fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 def processes_of(nodes: Mapping[str, int]) -> dict[str, list[int]]:
-    """Ids of nodes, and of their workers."""
+    """Return the process ids of nodes and of their workers."""
     out = {name: [pid] for name, pid in nodes.items()}
     for name, pid in nodes.items():
         children = [
@@ -563,7 +563,7 @@ def processes_of(nodes: Mapping[str, int]) -> dict[str, list[int]]:
 
 
 def measure_chain(folder: Path, times: int) -> None:
-    """Play the bag so many times to the nodes; print what was lost, latencies and CPU times."""
+    """Play the bag to the nodes `times` times; print losses, latencies and CPU times."""
     rclpy.init(args=[])
     reader = ChainReader()
     calibrated = {'calibration_directory': folder / 'calibration'}
@@ -618,7 +618,7 @@ def measure_chain(folder: Path, times: int) -> None:
 
 
 def wait_for_nodes(reader: ChainReader, count: int) -> None:
-    """Wait until the outputs of all nodes are there."""
+    """Wait until the outputs of all nodes are available."""
     topics = list(reader.came)
     end = time.monotonic() + 60
     while not all(map(reader.count_publishers, topics)) or len(reader.extraction) < 2:
@@ -628,7 +628,7 @@ def wait_for_nodes(reader: ChainReader, count: int) -> None:
 
 
 def print_chain(reader: ChainReader, stamps: Sequence[int]) -> None:
-    """Print which exposures were lost, and the latencies [ms] of what came."""
+    """Print the lost exposures and the latencies [ms] of the others."""
     for topic, came in reader.came.items():
         late = 1e-6 * np.array([came[s] - s for s in stamps if s in came])
         p50, p95, p99 = np.percentile(late, [50, 95, 99])
@@ -645,7 +645,7 @@ def print_chain(reader: ChainReader, stamps: Sequence[int]) -> None:
 
 
 def stopwatch(seconds: dict[str, float], part: str, owner: type, method: str) -> None:
-    """Add the time that calls of a method take to the seconds of a part."""
+    """Add the duration of calls of a method to the seconds of a part."""
     plain = getattr(owner, method)
 
     def timed(*arguments: Any, **keywords: Any) -> Any:
@@ -659,7 +659,7 @@ def stopwatch(seconds: dict[str, float], part: str, owner: type, method: str) ->
 
 
 def measure_parts(folder: Path, exposures: int, pause_s: float) -> None:
-    """Follow the images of the bag in this process, and print where the time goes."""
+    """Follow the images of the bag in this process, and print how the time is spent."""
     bodies = read_bodies(folder / 'bodies.csv')
     calibrations = read_calibrations(folder / 'calibration', NAMES)
     orientation = load_orientation(orientation_path(folder / 'calibration')).subset(NAMES)
@@ -709,7 +709,7 @@ def save_arrays(path: Path, found: Mapping[str, np.ndarray]) -> None:
 
 
 def compare_chain(folder: Path) -> None:
-    """Print how the truth, the live observations and those of this process differ."""
+    """Print the differences between truth, live observations and observations of this process."""
     truth = np.load(folder / 'truth.npz')
     for source in ('offline', 'live'):
         if not (folder / f'{source}.npz').exists():
@@ -748,7 +748,7 @@ def compare_chain(folder: Path) -> None:
 
 
 def chain(folder: Path, seconds: float, parts: bool, times: int) -> None:
-    """Render what is not there, and measure the chain, or the parts of an exposure."""
+    """Render missing data, and measure the chain or the parts of an exposure."""
     exposures = round(seconds * FILM_HZ)
     if not (folder / 'truth.npz').exists():
         write_chain(folder, exposures)
@@ -760,7 +760,7 @@ def chain(folder: Path, seconds: float, parts: bool, times: int) -> None:
 
 
 def play(bag: Path, times: int) -> None:
-    """Play a bag, as a camera would."""
+    """Play a bag as a camera would publish it."""
     rclpy.init(args=[])
     BagCamera(bag, times)
     rclpy.shutdown()

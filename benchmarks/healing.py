@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How well it is found out what has changed in a rig, and how good the healed rig is.
+"""Accuracy of the diagnosis of changes of a rig, and of the healed rig.
 
-The whole job heals recordings of scenarios, blind. Rigs, bodies, motion and projection are made
-here with scipy's rotations; nothing of them is shared with the package. Writes a section of
-docs/how_good.md: python -m benchmarks.healing --seeds 10
+The whole job heals recordings of scenarios without knowing the cause. Rigs, bodies, motion and
+projection are created here with scipy's rotations and share no code with the package. Writes a
+section of docs/how_good.md: python -m benchmarks.healing --seeds 10
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from .bodies import Rig, table
 NOISE_PX = 0.25
 CORRECTION_PX = 0.03
 FALSE_SHARE = 0.01
-EXPOSURES = 600  # of 5 s at 120 Hz, half of them for the verdict
-LEARNED_S = 30.0  # of the recording that shapes are learned from, at the same rate
-STEP_MM = 25.0  # of the grid of points in the common field
-# Errors of the calibration: T [mm], w [rad], xp, yp, c [px]; a is the rig frame.
+EXPOSURES = 600  # 5 s at 120 Hz, half of them for the verdict
+LEARNED_S = 30.0  # duration of the recording from which shapes are learned, at the same rate
+STEP_MM = 25.0  # spacing of the grid of points in the common field
+# Standard deviations of the calibration: T [mm], w [rad], xp, yp, c [px]; a defines the rig frame.
 RIG_SD = np.array([0.02] * 3 + [4e-5] * 3 + [0.2, 0.2, 0.6])
-LEFT_PX = 0.2  # of a drift of the distortion, where the markers were: less need not be found
-TAIL = 1e-3  # probability of a change of an orientation beyond its covariance, by chance
+LEFT_PX = 0.2  # undetected drift of the distortion, at the markers, that is acceptable
+TAIL = 1e-3  # probability that a change of orientation exceeds its covariance by chance
 SIZE = (1024, 1024)
 NAMES = ('a', 'b')
 
@@ -74,7 +74,7 @@ def bump_halfway(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
 
 
 def creep(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
-    """Move b by as much as a bump in the course of the recording."""
+    """Move b gradually by as much as a bump during the recording."""
     return bump(rng, times) * (times / times[-1])[:, None]
 
 
@@ -87,11 +87,11 @@ def focus(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Scenario:
-    """What happens to a rig, and what is to be found.
+    """A change of a rig, and the expected diagnosis.
 
-    change: returns errors (T, 18) of the rig that are added, from random numbers and times (T,).
-    moving: share of the usual motion. shift_mm: of a motion of the whole in addition. is_steady:
-    whether the rig stays as it is while it is recorded.
+    change: returns additional errors (T, 18) of the rig from a random generator and times (T,).
+    moving: fraction of the usual motion. shift_mm: amplitude of an additional common motion.
+    is_steady: whether the rig stays unchanged during the recording.
     """
 
     name: str
@@ -138,7 +138,7 @@ SCENARIOS = (
 
 
 class Recording:
-    """Bodies that a calibrated rig has learned, and a recording after a scenario has happened."""
+    """Bodies learned by a calibrated rig, and a recording after a scenario has happened."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self.scenario = scenario
@@ -170,7 +170,7 @@ class Recording:
         )
 
     def moving(self, times: np.ndarray, share: float) -> np.ndarray:
-        """Points (T, B, M, 3) of the markers: turns of up to 23 degrees, shifts of up to 25 mm."""
+        """Return points (T, B, M, 3) of markers: turns up to 23 degrees, shifts up to 25 mm."""
         phase, (turn, centre, swing) = self._motion
         angle = 1.6 * np.pi * times[:, None, None] + phase
         turned = Rotation.from_rotvec((share * 0.4 * turn * np.sin(angle)).reshape(-1, 3))
@@ -179,7 +179,7 @@ class Recording:
         return self.shapes @ np.swapaxes(turned_matrix, 2, 3) + place[:, :, None]
 
     def _learned(self) -> LearnedShapes:
-        """Shapes that the calibrated rig, with its errors, learns from a healthy recording."""
+        """Return the shapes that the calibrated rig, with its errors, learns before the change."""
         times = np.arange(0, LEARNED_S, 5 / EXPOSURES)
         healthy = replace(self.scenario, drift_px=0.0, exchanged=False)
         frames, _ = self.seen(self.moving(times, 1.0), times, self.errors, healthy)
@@ -191,7 +191,7 @@ class Recording:
         return learn_shapes(frames, self.calibrations(), self.orientation(), declared)
 
     def shape_errors_mm(self) -> np.ndarray:
-        """Errors of the learned shapes, RMS of a coordinate of each body, apart from the scale."""
+        """Return the RMS error of a coordinate of each learned body, apart from the scale."""
         out = []
         for body, shape in zip(self.bodies, self.shapes):
             own, arm = shape - shape.mean(axis=0), body.xyz_mm - body.xyz_mm.mean(axis=0)
@@ -201,8 +201,8 @@ class Recording:
         return np.array(out)
 
     def _changed(self, points: np.ndarray) -> np.ndarray:
-        """Points of bodies with what the scenario does to their markers."""
-        if self.scenario.migration_mm:  # along the line to another marker of the body
+        """Return points of bodies after the scenario has displaced markers."""
+        if self.scenario.migration_mm:  # move along the line to another marker of the body
             away = points[:, 0, 2] - points[:, 0, 0]
             away /= np.linalg.norm(away, axis=1)[:, None]
             points[:, 0, 2] += self.scenario.migration_mm * away
@@ -211,7 +211,7 @@ class Recording:
         return points
 
     def project(self, points: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """Image points (..., F, 2) of points (T, ..., 3) with errors (18,) or (T, 18)."""
+        """Return image points (..., F, 2) of points (T, ..., 3) with errors (18,) or (T, 18)."""
         errors = np.tile(errors, (len(points), 1)) if errors.ndim == 1 else errors
         flat = points.reshape(len(points), -1, 3)
         out = []
@@ -227,7 +227,7 @@ class Recording:
         return np.stack(out, axis=-2)
 
     def drift(self, uv: np.ndarray) -> np.ndarray:
-        """Drift (..., 2) of the distortion of b at pixels (..., 2)."""
+        """Return the drift (..., 2) of the distortion of b at pixels (..., 2)."""
         x, y = np.moveaxis((uv - 511.5) / 512, -1, 0)
         a = self.bend
         along_u = a[0] * x * x + a[1] * x * y + a[2] * x**3
@@ -236,9 +236,9 @@ class Recording:
     def seen(
         self, points: np.ndarray, times: np.ndarray, errors: np.ndarray, scenario: Scenario
     ) -> tuple[dict[str, list[Frame]], np.ndarray]:
-        """Frames of points (T, B, M, 3) with noise, false matches and errors of the correction.
+        """Return frames of points (T, B, M, 3) with noise, false matches and correction errors.
 
-        times (T,) [s]; errors (T, 18) of the rig. Also returns which (T, B M) have a false match.
+        times (T,) [s]; errors (T, 18) of the rig. Also return which (T, B M) have a false match.
         """
         uv = self.project(points, errors)
         uv = uv.reshape(len(points), -1, 2, 2)
@@ -263,12 +263,12 @@ class Recording:
         return frames, false.any(axis=2)
 
     def orientation(self) -> RigOrientation:
-        """Return the rig as it was calibrated."""
+        """Return the orientation of the rig as calibrated."""
         ids = tuple(one.calibration_id for one in self.calibrations().values())
         return replace(self.rig.orientation(), covariance=self.covariance, calibration_ids=ids)
 
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:
-        """Calibrations that correct nothing, with the claimed error of a correction."""
+        """Return calibrations that correct nothing, with the claimed error of a correction."""
         axis = np.linspace(0, 1023, 33)
         uv = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         functions = Functions(SIZE, 3)
@@ -304,7 +304,7 @@ class Recording:
         }
 
     def field(self) -> np.ndarray:
-        """Points (n, 3) of a grid that both fluoroscopes see after the bump."""
+        """Return points (n, 3) of a grid that both fluoroscopes see after the bump."""
         axis = np.arange(-200, 201, STEP_MM)
         grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(1, -1, 3)
         uv = self.project(grid, self.errors + self.change[0])[0]
@@ -316,21 +316,21 @@ class Recording:
 
 
 class Field:
-    """A smooth error of the correction of an image, of CORRECTION_PX."""
+    """A smooth error of the correction of an image, with standard deviation CORRECTION_PX."""
 
     def __init__(self, rng: np.random.Generator, waves: int = 30) -> None:
-        self.wave = rng.normal(0, 1 / 100, (waves, 2))  # some 100 px until it is another one
+        self.wave = rng.normal(0, 1 / 100, (waves, 2))  # correlated over about 100 px
         self.phase = rng.uniform(0, 2 * np.pi, (2, waves))
         self.size = CORRECTION_PX * np.sqrt(2 / waves)
 
     def __call__(self, uv: np.ndarray) -> np.ndarray:
-        """Errors (..., 2) [px] at pixels (..., 2)."""
+        """Return errors (..., 2) [px] at pixels (..., 2)."""
         angle = uv @ self.wave.T
         return self.size * np.stack([np.sin(angle + one).sum(-1) for one in self.phase], axis=-1)
 
 
 def intersected(rig: Rig, uv: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Points (..., 3) from image points (..., F, 2), by a rig with errors (18,)."""
+    """Intersect image points (..., F, 2) to points (..., 3), using a rig with errors (18,)."""
     rows = []
     right = []
     for f, (turn, source) in enumerate(rig.views()):
@@ -349,30 +349,30 @@ def intersected(rig: Rig, uv: np.ndarray, errors: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Result:
-    """What was found of the recordings of a scenario; errors are of rigs that pass."""
+    """Results for the recordings of a scenario; errors refer to rigs that pass."""
 
     right: int = 0
     within: int = 0
     unsure: int = 0
     wrong: int = 0
-    nse: list[float] = field(default_factory=list)  # of the six parameters of b, a mean
-    # RMS drift of the distortion that is left in a coordinate, where the markers were, apart from
-    # an affine map
+    nse: list[float] = field(default_factory=list)  # mean NSE of the six parameters of b
+    # RMS residual drift of a coordinate at the markers, after removing an affine map
     left_px: list[float] = field(default_factory=list)
     scale_ppm: list[float] = field(default_factory=list)
     scale_sd_ppm: list[float] = field(default_factory=list)
-    # RMS distance [mm] after the best rigid motion, where the markers were
+    # RMS distance [mm] at the markers, after the best rigid motion
     there_mm: list[float] = field(default_factory=list)
     there_sd_mm: list[float] = field(default_factory=list)
     # The same in the common field
     field_mm: list[float] = field(default_factory=list)
     field_sd_mm: list[float] = field(default_factory=list)
-    # RMS distance of the best rigid motion, where the markers were, also where nothing was found
+    # RMS distance of the best rigid motion at the markers, including rigs in which no change was
+    # found
     common_mm: list[float] = field(default_factory=list)
     common_said_mm: list[float] = field(default_factory=list)
 
     def cells(self) -> list[str]:
-        """Cells of a row of the table."""
+        """Return the cells of a table row."""
         ratio = [one / sd for one, sd in zip(self.field_mm, self.field_sd_mm)]
         return [
             *(str(n) for n in (self.right, self.within, self.unsure, self.wrong)),
@@ -410,7 +410,7 @@ def measure(scenario: Scenario, seeds: Iterable[int]) -> Result:
 
 
 def _is_within(result: Result, scenario: Scenario) -> bool:
-    """Whether what the last rig has not found lies within what it claims."""
+    """Return whether the undetected change of the last rig lies within its claimed errors."""
     if scenario.cause is Cause.DISTORTION:
         return result.left_px[-1] <= LEFT_PX
     return scenario.cause is Cause.ORIENTATION and 6 * result.nse[-1] <= chdtri(6, TAIL)
@@ -442,7 +442,7 @@ def _compare(recording: Recording, outcome: HealingOutcome, result: Result) -> N
 
 
 def _compare_distortion(recording: Recording, outcome: HealingOutcome, result: Result) -> None:
-    """Add what is left of a drift of b in a rig that passes."""
+    """Add the residual drift of b in a rig that passes."""
     there = recording.points[::10].reshape(-1, 3)
     uv = recording.project(there[None], recording.errors)[0]
     image = uv.copy()
@@ -460,7 +460,7 @@ def _compare_distortion(recording: Recording, outcome: HealingOutcome, result: R
 
 
 def _common_motion(recording: Recording, outcome: HealingOutcome) -> float:
-    """RMS distance by which the rig that is used afterwards moves all points together [mm]."""
+    """Return the RMS distance by which the rig in use afterwards shifts all points [mm]."""
     there = recording.points[::10].reshape(-1, 3)
     estimated = np.zeros(18) if outcome.healed is None else outcome.healed.changes.ravel()
     image = recording.project(there[None], recording.errors + recording.change[0])[0]
@@ -471,12 +471,12 @@ def _common_motion(recording: Recording, outcome: HealingOutcome) -> float:
 
 
 def _claimed(outcome: HealingOutcome, points: np.ndarray) -> RigErrors:
-    """Errors of points (n, 3) that the covariance of the healed rig claims."""
+    """Return the errors of points (n, 3) that the covariance of the healed rig claims."""
     return rig_errors(outcome.orientation, points)
 
 
 def _scale(points: np.ndarray, others: np.ndarray) -> float:
-    """Scale of points (n, 3) against others, less 1."""
+    """Return the scale of points (n, 3) relative to others, minus 1."""
     arm = others - others.mean(axis=0)
     other = points - points.mean(axis=0)
     turned = Rotation.align_vectors(arm, other)[0].apply(other)
@@ -486,13 +486,13 @@ def _scale(points: np.ndarray, others: np.ndarray) -> float:
 def _error(
     recording: Recording, points: np.ndarray, estimated: np.ndarray, true: np.ndarray
 ) -> float:
-    """RMS distance of points (n, 3) by the estimated rig after the best rigid motion [mm]."""
+    """Return RMS errors of points (n, 3) by the estimated rig after the best rigid motion [mm]."""
     image = recording.project(points[None], true)[0]
     return _misfit(intersected(recording.rig, image, estimated), points)
 
 
 def _misfit(found: np.ndarray, points: np.ndarray) -> float:
-    """RMS distance of points (n, 3) from others after the best rigid motion [mm]."""
+    """Return the RMS distance of points (n, 3) from others after the best rigid motion [mm]."""
     one = found - found.mean(axis=0)
     other = points - points.mean(axis=0)
     rest = Rotation.align_vectors(other, one)[0].apply(one) - other
@@ -500,7 +500,7 @@ def _misfit(found: np.ndarray, points: np.ndarray) -> float:
 
 
 def rms(values: Iterable[float]) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(list(values)))))
 
 
@@ -542,7 +542,7 @@ HEADER = (
 
 
 def main() -> None:
-    """Measure and write the section."""
+    """Run the measurements and write the section."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seeds', type=int, default=10, help='recordings of a scenario')
     parser.add_argument('--first', type=int, default=0, help='first seed')

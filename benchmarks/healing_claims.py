@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether the errors of healed rigs are as large as they claim, over many recordings.
+"""Compare errors of healed rigs with their claimed standard deviations over many recordings.
 
-Recordings of benchmarks.healing, healed with the cause given: only the estimate and its covariance
-are measured. Writes a section of docs/how_good.md: python -m benchmarks.healing_claims --seeds 60
+Recordings of benchmarks.healing are healed with the cause given, so that only the estimate and its
+covariance are evaluated. Writes a section of docs/how_good.md:
+python -m benchmarks.healing_claims --seeds 60
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ NAMES = (
     'the same, stand still',
     'bump, one body of four',
 )
-FIRST = 100  # seed: others than those of benchmarks.healing
-PARAMETERS = 6  # of b, that a knock changes
+FIRST = 100  # first seed, different from those of benchmarks.healing
+PARAMETERS = 6  # parameters of b that change after a knock
 
 
 def healed(recording: Recording) -> HealedRig:
-    """Heal a rig that has been knocked, as is known."""
+    """Heal a rig, given that it has been knocked."""
     calibrations, orientation, bodies = (
         recording.calibrations(),
         recording.orientation(),
@@ -103,7 +104,7 @@ HEADER = (
 
 
 def cells(found: np.ndarray) -> list[str]:
-    """Cells of a row of the table."""
+    """Return the cells of a table row."""
     out = [f'{found[:, 0].mean():.2f}', f'{np.sqrt(2 / PARAMETERS / len(found)):.2f}']
     for column, digits in ((1, 0), (3, 3), (5, 3)):
         error, claim = found[:, column], found[:, column + 1]
@@ -116,7 +117,7 @@ def cells(found: np.ndarray) -> list[str]:
 
 
 def main() -> None:
-    """Measure and write the section."""
+    """Run the measurements and write the section."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seeds', type=int, default=60, help='recordings of a scenario')
     arguments = parser.parse_args()

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether healed rigs claim what they err by where no marker has passed, too.
+"""Compare errors and claims of healed rigs, also where no marker has passed.
 
-Recordings of benchmarks.healing, healed by the whole job. Points are intersected from exact image
-points, so that their errors are those of rig and correction alone. Writes a section of
+Recordings of benchmarks.healing are healed by the whole job. Points are intersected from exact
+image points, so that rig and correction are the only sources of error. Writes a section of
 docs/how_good.md: python -m benchmarks.healing_field --seeds 24
 """
 
@@ -36,12 +36,12 @@ CASES = (
     'bump',
     'a twentieth of the bump',
 )
-FIRST = 100  # seed: others than those of benchmarks.healing
-FIGURES = 6  # of `errors_of`
+FIRST = 100  # first seed, different from those of benchmarks.healing
+FIGURES = 6  # number of values that `errors_of` returns
 
 
 def seen(recording: Recording, points: np.ndarray) -> np.ndarray:
-    """Exact image points (n, F, 2) of points, with the drift and the errors of the correction."""
+    """Return exact image points (n, F, 2) with the drift and the errors of the correction."""
     uv = recording.project(points[None], recording.errors + recording.change[0])[0]
     uv[:, 1] += recording.drift(uv[:, 1])
     errors = [field(uv[:, f]) for f, field in enumerate(recording.fields)]
@@ -49,7 +49,7 @@ def seen(recording: Recording, points: np.ndarray) -> np.ndarray:
 
 
 def places(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) where the markers were, and (m, 3) of the field far from all in image b."""
+    """Return points (n, 3) at the markers, and field points (m, 3) far from them in image b."""
     near = recording.points[::10].reshape(-1, 3)
     field = recording.field()
     away = cdist(seen(recording, field)[:, 1], seen(recording, near)[:, 1]).min(axis=1)
@@ -62,7 +62,7 @@ def errors_of(
     calibrations: Mapping[str, FluoroscopeCalibration],
     orientation: RigOrientation,
 ) -> list[float]:
-    """Return NSE, error and claim [mm]; error and claim relative to each other; sd of b [px]."""
+    """Return NSE, error and claim [mm]; relative error and claim [mm]; sd of b [px]."""
     image = seen(recording, points)
     on = ((image >= 0) & (image <= np.array(SIZE) - 1)).all(axis=(1, 2))
     points = points[on]
@@ -87,7 +87,7 @@ def errors_of(
 
 
 def measure(scenario: Scenario, seeds: Iterable[int]) -> tuple[int, np.ndarray]:
-    """Return how many did not pass, and errors (n, 2, FIGURES) near and far of those that did."""
+    """Return the number of failures, and errors (n, 2, FIGURES) near and far of the others."""
     rows = []
     failed = 0
     for seed in seeds:
@@ -103,7 +103,7 @@ def measure(scenario: Scenario, seeds: Iterable[int]) -> tuple[int, np.ndarray]:
 
 
 def cells(failed: int, found: np.ndarray) -> list[str]:
-    """Cells of a row of the table."""
+    """Return the cells of a table row."""
     out = [str(len(found)), str(failed)]
     for nse, *lengths in np.moveaxis(found, 0, -1):
         out += [f'{nse.mean():.2f}', *(f'{rms(one):.3f}' for one in lengths)]
@@ -130,7 +130,7 @@ HEADER = 'scenario|pass|not|' + '|'.join(
 
 
 def main() -> None:
-    """Measure and write the section."""
+    """Run the measurements and write the section."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seeds', type=int, default=24, help='recordings of a scenario')
     arguments = parser.parse_args()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Processes around the image node: a camera, and a relay that forwards images unchanged.
+"""Processes next to the image node: a camera, and a relay that forwards images unchanged.
 
     python -m benchmarks.image_processes camera --ros-args -p rate:=120.0 -p frames:=600
     python -m benchmarks.image_processes relay
@@ -40,7 +40,7 @@ from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from .relay import all_fatal
 
-DIFFERENT = 8  # images that are repeated
+DIFFERENT = 8  # distinct images, published in turn
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class CameraParameters:
 
 
 class Camera(Node):
-    """Publishes images of the phantom on a/image_raw at a rate, stamped just before."""
+    """Publishes images of the phantom on a/image_raw at a rate, stamped on publication."""
 
     def __init__(self) -> None:
         super().__init__('camera')
@@ -90,7 +90,7 @@ class Camera(Node):
             message = self._messages[number % DIFFERENT]
             struct.pack_into(
                 '<iI', message, 4, *divmod(time.time_ns(), 10**9)
-            )  # behind the head of CDR
+            )  # after the CDR header
             self._output.publish(bytes(message))
         self.get_logger().info(
             f'{self._settings.frames} images in {time.monotonic() - began:.2f} s'
@@ -99,20 +99,20 @@ class Camera(Node):
         rclpy.try_shutdown()
 
     def stop(self) -> None:
-        """End publishing."""
+        """Stop publishing."""
         self._ending.set()
         self._worker.join(2.0)
 
 
 class Relay(ManagedNode):
-    """Publishes every image of a/image_raw on a/relayed."""
+    """Republishes every image of a/image_raw on a/relayed."""
 
     def __init__(self) -> None:
         super().__init__('relay')
         self._reader: StreamReader | None = None
 
     def activate(self) -> None:
-        """Begin to relay."""
+        """Start to relay."""
         reader = StreamReader(self, all_fatal(self))
         publisher = self.create_publisher(Image, 'a/relayed', images_qos())
         reader.subscribe(

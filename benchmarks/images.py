@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Corrected images: the speed of one core, and of the live node compared with a plain relay.
+"""Speed of image correction: on one core, and in the live node compared with a plain relay.
 
     python -m benchmarks.images [--seconds 10] [--only NAME]      printed as the tables of
     docs/how_good/speed.md
     python -m benchmarks.images --picture docs/images/corrected_image.png
 
-Camera, node and the reader (this process, or one of its own for another transport) share the
+Camera, node and the reader (this process, or a separate one for another transport) share the
 machine. An image without an output is lost; latency is from the stamp of the camera, set
 just before it publishes, to the time stamp that DDS gives the output. A segment of shared memory
 of Fast DDS is smaller than an image by default: the cases `wide` use one of 32 MB, as described in
@@ -78,7 +78,7 @@ OUTPUTS = {'image_node': 'a/image_corrected', 'relay': 'a/relayed'}
 
 
 def calibration_of_the_rig() -> tuple[FluoroscopeCalibration, list[Frame]]:
-    """Calibration and frames of fluoroscope a of the rig that the camera shows."""
+    """Return calibration and frames of fluoroscope a of the rig that the camera shows."""
     rig = virtual_rig(1)
     frames = simulate_exposures(rig, 15, 1).frames['a']
     return calibrate({'a': frames}, rig.phantom).calibrations['a'], frames
@@ -90,7 +90,7 @@ def calibration_of_the_rig() -> tuple[FluoroscopeCalibration, list[Frame]]:
 def on_one_core(
     calibration: FluoroscopeCalibration, frames: Sequence[Frame], repeats: int = 200
 ) -> list[dict[str, Any]]:
-    """Times of the correction alone, and of scipy's map_coordinates with the same map.
+    """Measure the correction alone, and scipy's map_coordinates with the same map.
 
     ms: median wall time; rate: images per second of CPU.
     """
@@ -126,7 +126,7 @@ def on_one_core(
 
 
 class Reader:
-    """Publishes the calibration, and records the outputs of the nodes."""
+    """Publishes the calibration and records the outputs of the nodes."""
 
     def __init__(self, calibration: FluoroscopeCalibration) -> None:
         import rclpy
@@ -146,7 +146,7 @@ class Reader:
         self._reader: StreamReader | None = None
 
     def listen(self, topic: str) -> None:
-        """Collect (stamp, latency) [ns] of a topic, without decoding the images."""
+        """Collect (stamp, latency) [ns] of a topic without decoding the images."""
         from sensor_msgs.msg import Image
 
         from fluoro_calib_ros.nodes.runtime.streams import StreamReader
@@ -183,7 +183,7 @@ def wait(condition: Callable[[], Any], seconds: float, what: str) -> None:
 
 
 def _cpu(process: subprocess.Popen[Any]) -> float:
-    """CPU time [s] that a process has used, all its threads together."""
+    """Return the CPU time [s] that a process has used, summed over its threads."""
     fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / TICK
 
@@ -200,7 +200,7 @@ def _start(*command: str, log: IO[bytes], **parameters: Any) -> subprocess.Popen
 def measured(
     reader: Reader, encoding: str, rate: float, node: str, seconds: float, log: IO[bytes]
 ) -> dict[str, Any]:
-    """Figures of a node at a rate: losses, latencies [ms] and CPU time per image [ms]."""
+    """Measure a node at a rate: losses, latencies [ms] and CPU time per image [ms]."""
     frames = round(rate * seconds)
     command = (
         ['fluoro_calib_ros.nodes.image_node']
@@ -250,7 +250,7 @@ def measured(
 
 
 def _stream_figures(came: np.ndarray, frames: int) -> dict[str, Any]:
-    """Losses, rate [Hz] and latencies [ms] of received stamps and latencies (n, 2) [ns]."""
+    """Return losses, rate [Hz] and latencies [ms], given stamps and latencies (n, 2) [ns]."""
     latency = came[:, 1] * 1e-6
     span = (came[-1, 0] - came[0, 0]) * 1e-9
     return {
@@ -266,7 +266,7 @@ def _stream_figures(came: np.ndarray, frames: int) -> dict[str, Any]:
 def live(
     calibration: FluoroscopeCalibration, seconds: float, only: str = ''
 ) -> dict[str, dict[str, Any]]:
-    """Results by case, of those whose name contains `only`, with the current transports."""
+    """Return results of the cases whose name contains `only`, with the current transports."""
     import rclpy
 
     from fluoro_calib_ros.demo.assessment import isolate_ros_graph
@@ -285,7 +285,7 @@ def live(
 
 
 def live_wide(seconds: float, only: str = '') -> dict[str, dict[str, Any]]:
-    """The same in another process, with large segments of shared memory."""
+    """Return the same from another process, with large segments of shared memory."""
     with tempfile.NamedTemporaryFile('w', suffix='.xml') as profile:
         profile.write(WIDE)
         profile.flush()
@@ -310,7 +310,7 @@ def live_wide(seconds: float, only: str = '') -> dict[str, dict[str, Any]]:
 def run(
     seconds: float = 10.0, only: str = ''
 ) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """Results on one core, and live results by case."""
+    """Return results on one core, and live results by case."""
     calibration, frames = calibration_of_the_rig()
     return on_one_core(calibration, frames), live(calibration, seconds, only) | live_wide(
         seconds, only
@@ -318,7 +318,7 @@ def run(
 
 
 def draw(path: str, lines: int = 25) -> None:
-    """Draw a square pattern of beads as observed and as corrected, magnified in a corner."""
+    """Draw a square bead pattern as observed and as corrected, with a magnified corner."""
     fluoroscope = virtual_rig(1).fluoroscopes[0]
     calibration = calibration_of_the_rig()[0]
     at = np.linspace(24, 999, lines)
@@ -326,7 +326,8 @@ def draw(path: str, lines: int = 25) -> None:
     observed = fluoroscope.distortion.distort(grid)
     correction = calibration.correct(observed)
     seen = np.all((observed > 4) & (observed < 1019), axis=1) & (correction.status == 0)
-    # The gauge: a distortion is known up to a change of the orientation, a projective map.
+    # Remove the gauge: a distortion is known up to a projective map, that is, a change of
+    # orientation.
     plane = cv2.findHomography(grid[seen], correction.uv[seen])[0]
     straight = cv2.perspectiveTransform(grid[:, None], plane)[:, 0]
     image = bead_image(observed[seen], bead_px=4.5, contrast=0.8)
@@ -363,13 +364,13 @@ def draw(path: str, lines: int = 25) -> None:
 
 
 def _in_corner(uv: np.ndarray) -> np.ndarray:
-    """Whether points are in the magnified corner."""
+    """Return whether points are in the magnified corner."""
     left, top, side = CORNER
     return np.all((uv > (left, top)) & (uv < (left + side, top + side)), axis=1)
 
 
 def text_of(core: Sequence[dict[str, Any]], cases: dict[str, dict[str, Any]]) -> tuple[str, str]:
-    """Tables of one core and of the live cases."""
+    """Return the tables of one core and of the live cases."""
     rows = [
         [
             f'mono{f["depth"]} {f["interpolation"]}',

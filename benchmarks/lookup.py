@@ -30,9 +30,9 @@ from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtu
 from .timing import section, timed
 
 MODELS = tuple(name for name in selectable_models() if name != 'none')
-POINTS = 2**20  # of a large array
-FRAME = 30  # points of a frame
-ROUNDS = 41  # of one measurement of each function
+POINTS = 2**20  # points in a large array
+FRAME = 30  # points per frame
+ROUNDS = 41  # calls of each function in a measurement
 HEADER = [
     'model',
     'cell [px]',
@@ -48,10 +48,10 @@ HEADER = [
 
 @dataclass(frozen=True)
 class Figures:
-    """What was measured of one correction model.
+    """Measured figures of a correction model.
 
     kind and k; cell_px; error_px: largest difference of a coordinate from the exact model at
-    20,000 random pixels of the calibrated area, stated_px: that of the grid itself; build_s;
+    20,000 random pixels of the calibrated area, stated_px: as stated by the grid; build_s;
     points_per_s of a large array on one core; look_up_s, correct_s and predict_s of a frame, and
     ratio of predict_s to look_up_s.
     """
@@ -70,7 +70,7 @@ class Figures:
 
 
 def mean_time(function: Callable[[], Any], calls: int) -> float:
-    """Mean wall time [s] of a call."""
+    """Return the mean wall time [s] of a call."""
     began = time.perf_counter()
     for _ in range(calls):
         function()
@@ -80,9 +80,9 @@ def mean_time(function: Callable[[], Any], calls: int) -> float:
 def side_by_side(
     ours: Callable[[], Any], correct: Callable[[], Any], theirs: Callable[[], Any]
 ) -> tuple[float, float, float, float]:
-    """Median times [s] of three functions, and median ratio of the third to the first.
+    """Return median times [s] of three functions, and the median ratio of the third to the first.
 
-    They are called in rounds, so that other load of the machine affects all of them.
+    They are called in turn, so that other load on the machine affects all of them.
     """
     rounds = np.array(
         [
@@ -94,7 +94,7 @@ def side_by_side(
 
 
 def points_per_second(grid: CorrectionGrid, rng: np.random.Generator) -> float:
-    """Points of a large array that one core looks up per second; median of 15 runs.
+    """Return how many points of a large array one core looks up per second; median of 15 runs.
 
     The pixels are in random order, which is the worst case for the cache.
     """
@@ -110,7 +110,7 @@ def points_per_second(grid: CorrectionGrid, rng: np.random.Generator) -> float:
 
 
 def measure(model: str) -> Figures:
-    """Measure a correction model, by name, on a calibration of 15 exposures of the virtual rig."""
+    """Measure a correction model, given by name, on a calibration from 15 virtual exposures."""
     rig = virtual_rig(1)
     rng = np.random.default_rng(0)
     frames = {
@@ -126,7 +126,7 @@ def measure(model: str) -> Figures:
     calibration.prepare()
     frame = rng.uniform(80, 940, (FRAME, 2))
     u, v = np.ascontiguousarray(frame.T)
-    # A model without neighbours is compared with the regressor of the paper, k = 3.
+    # For a model without neighbours, compare with the regressor of the paper, k = 3.
     peer = KNeighborsRegressor(exact.k or 3, algorithm='kd_tree').fit(
         exact.train_uv, exact.train_duv
     )
@@ -148,7 +148,7 @@ def measure(model: str) -> Figures:
 
 
 def row(f: Figures) -> list[str]:
-    """A row of the table."""
+    """Return a row of the table."""
     return [
         f'{f.kind}, k = {f.k}' if f.k else f.kind,
         f'{f.cell_px:g}',
@@ -163,7 +163,7 @@ def row(f: Figures) -> list[str]:
 
 
 def lookup_section(models: Sequence[str] = MODELS) -> str:
-    """The lookup grid by correction model."""
+    """Return the section on the lookup grid, by correction model."""
     return section(
         'Lookup of the correction',
         'A grid is built when a calibration arrives; looking up a point gives du, dv, standard '

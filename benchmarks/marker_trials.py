@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wrong ids of markers that nothing declares, 0.2 s later.
+"""Wrong marker ids that are still undeclared 0.2 s later.
 
     python -m benchmarks.marker_trials --trials 100
 
 Each trial is 2 s at 30 Hz of five bodies of six markers, whose shapes are known, in front of
-bones. They cross each other in the images, a fifth of which is missing; in the middle, an impact
-moves and turns each body in another direction. Ids are wrong where the place is that of another
-marker, or of none. They are declared where they are doubtful, or where a decision of the next
-0.2 s takes them back.
+bones. They cross each other in the images, a fifth of which is missing; half-way, an impact shifts
+and turns each body in a different direction. An id is wrong if its position is that of another
+marker or of none. It is declared if it is marked doubtful, or if a decision within the next 0.2 s
+retracts it.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ from .markers import FALSE_PX, calibrated, known_bodies
 
 SEED = 400
 FIRST_RIG = 4400
-RIG_EVERY = 10  # trials
+RIG_EVERY = 10  # trials per rig
 FRAMES = 60
-LATER = 6  # exposures: 0.2 s
-MISSING = 0.2  # share of the images, after the first exposure
-APART_MM = 70.0  # bodies cross each other
+LATER = 6  # exposures in 0.2 s
+MISSING = 0.2  # fraction of missing images, after the first exposure
+APART_MM = 70.0  # bodies cross each other at this distance
 IMPACT = FRAMES / 2
-IMPACT_MM = 8.0  # way in the first exposure after the impact: 0.24 m/s
+IMPACT_MM = 8.0  # shift in the first exposure after the impact: 0.24 m/s
 IMPACT_RAD = 0.08
-DECAY = 3.0  # exposures in which the impact dies away
+DECAY = 3.0  # decay constant of the impact, in exposures
 
 
 class HitMarkers(MovingMarkers):
-    """Clusters in motion that an impact moves on, each in a direction of its own."""
+    """Moving clusters that an impact deflects, each in its own direction."""
 
     def __init__(self, scene: MarkerScene, seed: int) -> None:
         super().__init__(scene, seed)
@@ -63,7 +63,7 @@ class HitMarkers(MovingMarkers):
         self._spin = IMPACT_RAD * way[1]
 
     def poses(self, frame: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Rotations (3, 3) and shifts (3,) [mm] of all clusters at an image number."""
+        """Return rotations (3, 3) and shifts (3,) [mm] of all clusters at an image number."""
         since = max(frame - IMPACT, 0.0)
         part = DECAY * (1 - np.exp(-since / DECAY)) * np.exp(-since / (4 * DECAY))
         return [
@@ -74,13 +74,13 @@ class HitMarkers(MovingMarkers):
 
 @dataclass(frozen=True)
 class Counts:
-    """What was counted in trials."""
+    """Counts over trials."""
 
     images: int = 0
     seen: int = 0
     measured: int = 0
     wrong: int = 0
-    undeclared: int = 0  # at once
+    undeclared: int = 0  # immediately
     undeclared_later: int = 0
     trials_undeclared: int = 0
     not_begun: int = 0
@@ -90,7 +90,7 @@ class Counts:
         return Counts(**sums)
 
     def line(self, trials: int) -> str:
-        """Return what was counted, in words."""
+        """Return the counts as text."""
         return (
             f'{trials} trials, {self.images} images: {self.measured / max(self.seen, 1):.2%} of '
             f'{self.seen} visible markers measured; {self.wrong} ids wrong, of them '
@@ -100,7 +100,7 @@ class Counts:
 
 
 def exposures(sequence: MarkerSequence, seed: int) -> Iterator[Mapping[str, MarkerImage | None]]:
-    """Yield the images of each moment by fluoroscope, None for those that are missing."""
+    """Yield the images of each moment by fluoroscope; missing images are None."""
     rng = np.random.default_rng([seed, 32])
     for number, images in enumerate(sequence):
         there = (rng.random(len(images)) >= MISSING) | (number == 0)
@@ -175,7 +175,7 @@ def counts_of(
 
 
 def _revised(found: MarkerFrame, name: str, decisions: list[Decision]) -> MarkerFrame:
-    """Return the markers of a view after the decisions on it."""
+    """Return the markers of a view after applying later decisions."""
     for decision in decisions:
         if decision.fluoroscope == name and decision.since <= found.frame:
             found = revise(found, decision)
@@ -183,9 +183,9 @@ def _revised(found: MarkerFrame, name: str, decisions: list[Decision]) -> Marker
 
 
 def _wrong(found: MarkerFrame, image: MarkerImage, target_id: np.ndarray) -> np.ndarray:
-    """Whether (n,) markers are not where they should be.
+    """Return whether (n,) markers are away from their true positions.
 
-    A shadow that an impact smears is where its marker is in the mean over the exposure.
+    For a shadow smeared by an impact, the mean marker position over the exposure is accepted, too.
     """
     row = np.searchsorted(target_id, found.target_id)
     away = [np.linalg.norm(found.uv - true[row], axis=1) for true in (image.uv, image.mean_uv)]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Following of markers in two views and more: ids, precision and speed.
+"""Following markers in two or more views: ids, precision and speed.
 
     python -m benchmarks.markers --frames 200           all settings, as the table of
                                                         docs/how_good.md
@@ -12,9 +12,9 @@
 
 30 markers in five bones, 1024 x 1024 px, views with distortion, calibrated from simulated
 exposures of a phantom with noise. Settings of renderer and motion are drawn for every sequence.
-The Cramer-Rao bound is that of the rendered light: its derivatives by the place of a marker,
-against the variance of photons, with unknown depth of the shadow and a background of degree 2, for
-markers that stand alone.
+The Cramer-Rao bound is that of the rendered light: its derivatives with respect to the position of
+a marker, relative to the photon variance, with unknown depth of the shadow and a background of
+degree 2, for isolated markers.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ from fluoro_calib_ros.simulation.rig import (
     virtual_rig,
 )
 
-FIRST_RIG = 2000  # seeds below are those of development and tests
+FIRST_RIG = 2000  # smaller seeds are used in development and tests
 FRAMES_OF_A_SEQUENCE = 250
 FALSE_PX = 1.5
 ALONE_PX = 14.0
@@ -77,18 +77,18 @@ BOUND_EVERY = 50
 BOUND_REACH = 7
 STEP_MM = 0.05
 SEED = 100
-START_EVERY = 20  # exposures from which on bodies are looked for
-START_HZ = 30.0  # exposures, START_EXPOSURES of them
+START_EVERY = 20  # interval of exposures at which the search for bodies starts
+START_HZ = 30.0  # rate of START_EXPOSURES exposures
 START_EXPOSURES = 30
 START_S = 0.5
 SHAPE_SD_MM = 0.05
-GIVEN_SD_PX = 0.5  # of the given places of the first frame
+GIVEN_SD_PX = 0.5  # standard deviation of the given positions in the first frame
 
 SETS = ('plain', 'usual', 'fast', 'hard')
 
 
 def settings_of(rng: np.random.Generator, kind: str) -> tuple[MarkerScene, RadiographSettings]:
-    """Draw scene and settings of a sequence."""
+    """Draw random scene and settings of a sequence."""
     hard = kind == 'hard'
     settings = replace(
         HARD_MARKER_SETTINGS if hard else MARKER_SETTINGS,
@@ -110,7 +110,7 @@ def settings_of(rng: np.random.Generator, kind: str) -> tuple[MarkerScene, Radio
 
 @dataclass
 class Record:
-    """What was counted and measured."""
+    """Counts and measurements."""
 
     frames: int = 0
     seen: int = 0
@@ -124,7 +124,7 @@ class Record:
     sigma: list[np.ndarray] = field(default_factory=list)
     free: list[np.ndarray] = field(default_factory=list)
     bound: list[np.ndarray] = field(default_factory=list)
-    points: int = 0  # markers that two views and more see
+    points: int = 0  # markers seen in two or more views
     intersected: int = 0
     distance: list[np.ndarray] = field(default_factory=list)
     residual: list[np.ndarray] = field(default_factory=list)
@@ -154,7 +154,7 @@ class Record:
     ) -> None:
         """Compare distances between the points of a body with the truth.
 
-        seen (n,): views that see a marker.
+        seen (n,): number of views that see each marker.
         """
         good = found.points.status <= OUTSIDE
         self.points += int(np.count_nonzero(seen >= 2))
@@ -168,7 +168,7 @@ class Record:
                 self.distance.append(pdist(found.points.xyz_mm[good][own]) - true)
 
     def in_space(self) -> str:
-        """Return what is true of the points in space."""
+        """Return the results for points in space as text."""
         distance = np.concatenate(self.distance)
         residual = np.concatenate(self.residual)
         return (
@@ -200,7 +200,7 @@ class Record:
 
 
 def bounds(radiography: MarkerRadiography, frame: int, true: np.ndarray) -> np.ndarray:
-    """Cramer-Rao bounds (n,) of a coordinate [px] of markers at true (n, 2), NaN if not alone."""
+    """Return Cramer-Rao bounds (n,) [px] of markers at true (n, 2), NaN unless isolated."""
     every = np.arange(len(true))
     fluoroscope = radiography.fluoroscope
     light = radiography.expected_light(frame, every)
@@ -239,7 +239,7 @@ def bounds(radiography: MarkerRadiography, frame: int, true: np.ndarray) -> np.n
 
 
 def bounds_of(radiography: MarkerRadiography, truth: list[MarkerImage]) -> list[np.ndarray]:
-    """Cramer-Rao bounds of markers that are seen, in some of the exposures of a view."""
+    """Return Cramer-Rao bounds of visible markers in some of the exposures of a view."""
     out = []
     for exposure in range(BOUND_EVERY, len(truth) + 1, BOUND_EVERY):
         image = truth[exposure - 1]
@@ -251,7 +251,7 @@ def bounds_of(radiography: MarkerRadiography, truth: list[MarkerImage]) -> list[
 def calibrated(
     seed: int, names: str = 'ab'
 ) -> tuple[VirtualRig, Mapping[str, FluoroscopeCalibration], RigOrientation]:
-    """A rig, and its joint calibration from 15 simulated exposures of each fluoroscope."""
+    """Return a rig and its joint calibration from 15 simulated exposures of each fluoroscope."""
     between = BETWEEN_DEG if len(names) == 2 else BETWEEN_THREE_DEG
     rig = virtual_rig(seed, names=names, between_deg=between)
     outcome = calibrate(simulate_exposures(rig, 15, seed).frames, rig.phantom, joint=True)
@@ -260,7 +260,7 @@ def calibrated(
 
 
 def first_markers(rng: np.random.Generator, ids: np.ndarray, image: MarkerImage) -> FirstMarkers:
-    """Markers of the first image, given with an error."""
+    """Return the markers of the first image, with errors in their positions."""
     uv = image.uv[image.seen]
     return FirstMarkers(ids[image.seen], uv + rng.normal(0, GIVEN_SD_PX, uv.shape))
 
@@ -268,9 +268,9 @@ def first_markers(rng: np.random.Generator, ids: np.ndarray, image: MarkerImage)
 def follow(
     kind: str, number: int, frames: int, names: str = 'ab', start: bool = False
 ) -> tuple[Record, Record]:
-    """Follow a sequence; returns what was true live, and after later decisions.
+    """Follow a sequence; return the records of live results, and of those after later decisions.
 
-    start: the shapes of the bodies give the ids; else the first places are given.
+    start: whether the shapes of the bodies give the ids; otherwise, initial positions are given.
     """
     rng = np.random.default_rng([SEED, number, SETS.index(kind)])
     scene, settings = settings_of(rng, kind)
@@ -334,7 +334,7 @@ def in_space(
     calibrations: Mapping[str, FluoroscopeCalibration],
     orientation: RigOrientation,
 ) -> list[ReconstructedFrame]:
-    """Points of all exposures, without markers whose id is doubtful."""
+    """Return the points of all exposures, excluding markers with doubtful ids."""
     intersector = Intersector(orientation)
     out = []
     for number, exposure in enumerate(zip(*views.values(), strict=True), 1):
@@ -349,7 +349,7 @@ def in_space(
 
 
 def known_bodies(markers: MovingMarkers) -> tuple[Body, ...]:
-    """Bodies of known shapes."""
+    """Return bodies of known shapes."""
     out = []
     for cluster in range(markers.scene.clusters):
         own = markers.cluster == cluster
@@ -359,7 +359,7 @@ def known_bodies(markers: MovingMarkers) -> tuple[Body, ...]:
 
 
 def measure_start(kind: str, rigs: int, names: str = 'ab') -> None:
-    """Print how soon bodies in any poses are identified by their shapes, and wrong ids."""
+    """Print how soon bodies in any pose are identified by their shapes, and the wrong ids."""
     late = []
     ids = wrong = 0
     for number in range(rigs):
@@ -398,7 +398,7 @@ def measure_start(kind: str, rigs: int, names: str = 'ab') -> None:
 
 @dataclass(frozen=True)
 class _Started:
-    """Seconds from the first exposure to the identified bodies, ids by then, wrong ones."""
+    """Seconds from the first exposure to identification, ids by then, and wrong ids."""
 
     seconds: float
     ids: int
@@ -446,7 +446,7 @@ def joined(records: list[Record]) -> Record:
 
 
 def measure_speed(frames: int = 80) -> None:
-    """Print the seconds of a core that an image takes, and what they are spent on."""
+    """Print the time that an image takes on one core, and how it is spent."""
     rig = virtual_rig(FIRST_RIG)
     markers = MovingMarkers(MarkerScene(), SEED)
     radiography = MarkerRadiography(rig.fluoroscopes[0], markers, MARKER_SETTINGS, frames, SEED)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Correction models and regressors of scikit-learn compared out of sample on virtual rigs.
+"""Compare correction models and scikit-learn regressors out of sample on virtual rigs.
 
 python -m benchmarks.models            the table of docs/how_good.md
 python -m benchmarks.models --rigs 3   on more rigs
@@ -42,9 +42,9 @@ from .timing import section, timed
 TRAIN_EXPOSURES = 15
 TEST_EXPOSURES = 40
 TEST_SEED = 10**6
-MAX_ROUNDS = 15  # of a regressor of scikit-learn: each round costs seven fits
+MAX_ROUNDS = 15  # for a scikit-learn regressor, since each round costs seven fits
 GRID_PX = 16.0  # spacing of the pixels at which the correction is compared
-NAME = 'a'  # of the fluoroscope
+NAME = 'a'  # fluoroscope
 
 OURS = ('none', 'knn', 'local_linear', 'parametric', 'hybrid', 'collocation')
 THEIRS: dict[str, Callable[[], Any]] = {
@@ -70,7 +70,7 @@ HEADER = [
 
 @dataclass(frozen=True)
 class Scene:
-    """A virtual rig with exposures of one fluoroscope to calibrate and to test with."""
+    """A virtual rig with exposures of one fluoroscope for calibration and test."""
 
     rig: VirtualRig
     train: SimulatedExposures
@@ -79,12 +79,12 @@ class Scene:
 
 @dataclass(frozen=True)
 class Figures:
-    """What was measured of a model on one rig.
+    """Measured figures of a model on one rig.
 
     points_mm: 3-D RMSE of the points of test exposures, adjusted with the calibration fixed;
-    ratio to that of known distortion; correction_px: RMS difference of a coordinate from the true
-    distortion over the calibrated area, without the gauge; rounds; converged; seconds of the
-    calibration.
+    ratio: points_mm relative to known distortion; correction_px: RMS difference of a coordinate
+    from the true distortion over the calibrated area, without the gauge; rounds; converged;
+    seconds of the calibration.
     """
 
     points_mm: float
@@ -107,20 +107,20 @@ def make_scene(seed: int) -> Scene:
 
 
 def points_error(scene: Scene, frames: list[Frame], result: CalibrationResult) -> float:
-    """3-D RMSE [mm] of the object points of frames, adjusted with a calibration held."""
+    """Return the 3-D RMSE [mm] of object points of frames, adjusted with a fixed calibration."""
     found = adjust_with_calibrations({NAME: frames}, scene.rig.phantom, result.calibrations)
     true = scene.rig.true_mm[scene.rig.phantom.index(found.targets.target_id)]
     return float(np.sqrt(np.mean(np.sum((found.targets.xyz_mm - true) ** 2, axis=1))))
 
 
 def undistorted(exposures: SimulatedExposures) -> list[Frame]:
-    """Frames of exposures as an undistorted image would show them."""
+    """Return frames of exposures as an undistorted image would show them."""
     pairs = zip(exposures.frames[NAME], exposures.undistorted[NAME])
     return [replace(frame, uv=uv) for frame, uv in pairs]
 
 
 def known_distortion_error(scene: Scene) -> float:
-    """3-D RMSE [mm] of the object points with the distortion known exactly."""
+    """Return the 3-D RMSE [mm] of the object points with exactly known distortion."""
     result = calibrate(
         {NAME: undistorted(scene.train)}, scene.rig.phantom, CalibrationOptions('none')
     )
@@ -128,7 +128,7 @@ def known_distortion_error(scene: Scene) -> float:
 
 
 def correction_errors(scene: Scene, result: CalibrationResult) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) of a grid, and the errors (n, 2) [px] of the correction, gauge removed."""
+    """Return grid pixels (n, 2) and errors (n, 2) [px] of the correction, gauge removed."""
     calibration = result.calibrations[NAME]
     true = next(f for f in scene.rig.fluoroscopes if f.name == NAME).distortion
     axes = [np.arange(0.0, size, GRID_PX) for size in calibration.image_size]

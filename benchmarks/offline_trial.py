@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Images of a trial to joint angles by the commands: `python -m benchmarks.offline_trial`.
+"""Process images of a trial to joint angles by commands: `python -m benchmarks.offline_trial`.
 
 Ten seconds of two views of 1024 x 1024 px and 8 bits at 250 Hz, 30 markers in five bodies, in a
-bag. `fluoro-calib extract` follows the markers, their ids from the shapes of the bodies,
+bag. `fluoro-calib extract` follows the markers, with ids from the shapes of the bodies,
 `fluoro-calib bodies` gives poses and joint angles, and `fluoro-calib convert` the poses as C3D.
-Prints the time of each command, and how far the poses are from the truth. `--folder` keeps what
-is rendered.
+Prints the time of each command, and the errors of the poses. `--folder` keeps the rendered
+data.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ convention = "cardan_zxy"
 
 
 def run(command: list[str]) -> float:
-    """Run a command of the package; print and return its seconds."""
+    """Run a command of the package; print and return its duration in seconds."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began = time.perf_counter()
     subprocess.run([sys.executable, '-m', 'fluoro_calib_ros.cli', *command], check=True)
@@ -59,9 +59,9 @@ def run(command: list[str]) -> float:
 
 
 def compare(poses: Path, exposures: int) -> None:
-    """Print how many poses there are, and how far turns between them are from the truth.
+    """Print the number of poses, and the errors of the rotations between them.
 
-    Relative to the first exposure with a pose, the frame of the rig does not matter.
+    Rotations are relative to the first exposure with a pose, so the rig frame does not matter.
     """
     markers = MovingMarkers(MarkerScene(), CHAIN_SEED)
     true = [markers.poses(number) for number in range(1, exposures + 1)]
@@ -76,7 +76,7 @@ def compare(poses: Path, exposures: int) -> None:
         )
         at = [int(row['exposure']) - 1 for row in own]
         known = Rotation.from_matrix([true[row][number][0] for row in at])
-        # A turn about the axes of the body is the same in every frame of the rig.
+        # A rotation about the axes of the body is the same in every rig frame.
         turned = (found[0].inv() * found).inv() * (known[0].inv() * known)
         errors.append(turned[1:].magnitude())
     rms = np.degrees(np.sqrt(np.mean(np.concatenate(errors) ** 2)))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The online path at lab rates: nodes as processes, compared with plain relays.
+"""The online processing at lab rates: nodes as processes, compared with plain relays.
 
     python -m benchmarks.online [--seconds 60] [--only NAME]
 
@@ -11,8 +11,8 @@ input (of the last view, for points) to the publication of the output, from the 
 (the median of its medians, and the largest of its 99 %, each of 2,000 frames); and from
 the stamp of the simulator, set just before it publishes, to the time stamp that DDS gives the
 output when it is published, which includes the transfer by DDS. Bodies are the five rigid clusters
-of six markers, whose poses are the output in place of the points. The calibration node publishes
-nothing for the frames of markers, which it ignores: only its CPU time is measured. A flood is that
+of six markers, whose poses replace the points as output. The calibration node ignores frames of
+markers and publishes nothing for them: only its CPU time is measured. A flood is that
 of tests/ros/flooder.py, on the input of fluoroscope a or, as the same load without messages, on
 a topic that nobody reads.
 """
@@ -89,8 +89,8 @@ DEEP = {
     f'qos_overrides./{name}/corrected_observations.{end}.depth': 1000
     for name in 'ab'
     for end in ('publisher', 'subscription')
-}  # queues of a second instead of a tenth
-# As config/shed_floods.xml says, which limits what such a reader keeps.
+}  # queues of one second instead of a tenth
+# As in config/shed_floods.xml, which limits how much such a reader keeps.
 SHED = {
     f'qos_overrides./{name}/{topic}.subscription.history': 'keep_all'
     for name in NAMES
@@ -121,7 +121,7 @@ def logged(node: Node) -> FaultHandlers:
 
 
 class Reader(Node):
-    """Publishes the calibration, and counts the outputs of the nodes."""
+    """Publishes the calibration and counts the outputs of the nodes."""
 
     def __init__(self, calibrations: Mapping[str, Calibration], orientation: Orientation) -> None:
         super().__init__('reader')
@@ -134,7 +134,7 @@ class Reader(Node):
         self.create_publisher(RigOrientation, 'rig_orientation', latched_qos()).publish(
             message_from_orientation(orientation)
         )
-        self.ready: set[str] = set()  # fluoroscopes that are corrected
+        self.ready: set[str] = set()  # fluoroscopes whose correction is running
         for name in NAMES:
             self.create_subscription(
                 CameraInfo,
@@ -165,7 +165,7 @@ class Reader(Node):
                 )
 
     def listen(self, nodes: Sequence[str], of_bodies: bool) -> None:
-        """Start to count the outputs of nodes: of a reconstruction poses of bodies, or points."""
+        """Start counting the outputs of nodes; for a reconstruction, poses of bodies or points."""
         self.came = {}
         self.within = {}
         reader = StreamReader(self, logged(self))
@@ -211,7 +211,7 @@ class Reader(Node):
 
 
 def _number_and_latency(data: bytes, info: dict[str, int]) -> tuple[int, int]:
-    """Frame number and latency [ns] of the CDR bytes of a message with header, frame_number."""
+    """Return frame number and latency [ns] from the CDR bytes of a message."""
     seconds, nanoseconds, length = struct.unpack_from('<iII', data, 4)
     at = 4 + (12 + length + 3) // 4 * 4
     return struct.unpack_from('<I', data, at)[0], info[
@@ -220,7 +220,7 @@ def _number_and_latency(data: bytes, info: dict[str, int]) -> tuple[int, int]:
 
 
 def _cpu(process: subprocess.Popen[Any]) -> float:
-    """CPU time [s] that a process has used, all its threads together."""
+    """Return the CPU time [s] that a process has used, summed over its threads."""
     fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / TICK
 
@@ -246,7 +246,7 @@ def measured(
     log: IO[bytes],
     parameters: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
-    """[{node, lost, p50, p99, max [ms], cpu [us a message]}] of a case."""
+    """Return [{node, lost, p50, p99, max [ms], cpu [us a message]}] of a case."""
     processes = {
         node: subprocess.Popen(
             _command(node, **parameters, **OWN_PARAMETERS.get(node, {})), stdout=log, stderr=log
@@ -297,7 +297,7 @@ def measured(
 
 
 def _nearly(came: Mapping[Any, Sequence[tuple[int, int]]], frames: int) -> bool:
-    """Whether all but the last frames have come: CPU time is measured up to here."""
+    """Return whether all but the last frames have arrived, where CPU time measurement ends."""
     return all(of_one[-1][0] >= frames - 10 for of_one in came.values())
 
 
@@ -305,7 +305,7 @@ def _figures(
     reader: Reader, node: str, frames: int, used: float, counted: Mapping[Any, int]
 ) -> dict[str, Any]:
     if node == 'calibration_node':
-        # Of the same messages as the other node; it has been waited for until it had all.
+        # The messages are those of the other node; the measurement waited until all had arrived.
         messages = sum(counted.values())
         unknown = dict.fromkeys(('within_p50', 'within_p99', 'p50', 'p95', 'p99', 'max'), np.nan)
         lost = len(NAMES) * frames - sum(reader.taken.values())
@@ -339,7 +339,7 @@ def _figures(
 
 
 def rig_of_the_simulator() -> tuple[dict[str, Calibration], Orientation]:
-    """Calibrations and orientation of the rig that the simulator shows."""
+    """Return calibrations and orientation of the rig that the simulator shows."""
     rig = virtual_rig(1)
     frames = simulate_exposures(rig, 15, 1).frames
     job = calibrate(frames, rig.phantom)
@@ -360,14 +360,14 @@ def write_clusters(folder: Path) -> Path:
 
 
 def parameters_of(case: str, bodies: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Parameters of the nodes in a case."""
+    """Return the parameters of the nodes in a case."""
     of_kind = {'deep': DEEP, 'bodies': bodies, 'shed': SHED}
     return next((given for kind, given in of_kind.items() if kind in case), {})
 
 
 @contextmanager
 def flood(case: str, log: IO[bytes]) -> Iterator[None]:
-    """A hostile peer publishes, or one on a topic that nobody reads, where the case says so."""
+    """Run a hostile publisher, or one on a topic that nobody reads, if the case requires it."""
     if 'flood' not in case:
         yield
         return
@@ -384,7 +384,7 @@ def flood(case: str, log: IO[bytes]) -> Iterator[None]:
 
 @contextmanager
 def shedding(on: bool) -> Iterator[None]:
-    """The nodes that are started read config/shed_floods.xml."""
+    """Let nodes that are started in this context read config/shed_floods.xml."""
     variable = 'FASTRTPS_DEFAULT_PROFILES_FILE'
     before = os.environ.get(variable)
     if on:
@@ -398,7 +398,7 @@ def shedding(on: bool) -> Iterator[None]:
 
 
 def run(seconds: float, only: str = '') -> dict[str, list[dict[str, Any]]]:
-    """Results of the nodes by case."""
+    """Return the results of the nodes by case."""
     isolate_ros_graph()
     rclpy.init(args=[])
     reader = Reader(*rig_of_the_simulator())
@@ -439,7 +439,7 @@ def run(seconds: float, only: str = '') -> dict[str, list[dict[str, Any]]]:
 
 
 def text_of(results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
-    """Markdown table of the results."""
+    """Return a Markdown table of the results."""
     rows = []
     for case, figures in results.items():
         for f in figures:

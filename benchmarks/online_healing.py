@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The stream while shapes are learned, and while a rig that was bumped is healed and accepted.
+"""The stream while shapes are learned, and while a bumped rig is healed and accepted.
 
 A recording of 30 markers in five bodies at 2 x 120 Hz, of a healthy rig and then of the bumped
-one, is played by its node to the whole chain: calibration, correction and reconstruction. This
-process counts what they publish: an exposure without its corrected observations or its points is
-lost. All share the machine. Writes a section of docs/how_good/speed.md:
+one, is played by the player node to the whole chain: calibration, correction and reconstruction.
+This process counts the published messages: an exposure without corrected observations or points
+is lost. All processes share the machine. Writes a section of docs/how_good/speed.md:
 python -m benchmarks.online_healing
 """
 
@@ -58,9 +58,9 @@ from .online import BODIES, NAMES, ROOT, _command, logged, rig_of_the_simulator
 
 RATE_HZ = 120
 HEALTHY_S = 25.0
-LEARNED_S = 15.0  # of these
-BUMPED_S = 240.0  # at most: the diagnosis takes longer where other programs compute
-ACCEPTED_S = 10.0  # that are counted with the healed rig
+LEARNED_S = 15.0  # part of the healthy recording from which shapes are learned
+BUMPED_S = 240.0  # maximum; the diagnosis takes longer if other programs compute
+ACCEPTED_S = 10.0  # counted time with the healed rig
 COLLECTED_S = 5.0
 MOVED_MM = (3.0, -2.0, 3.5)  # 5 mm and 0.5 degrees
 TURNED_DEG = (0.35, -0.28, 0.22)
@@ -69,7 +69,7 @@ POINTS = 'reconstruction/points_with_covariance'
 
 
 def bumped(rig: VirtualRig) -> VirtualRig:
-    """The rig after b was bumped."""
+    """Return the rig after b was bumped."""
     a, b = rig.fluoroscopes
     turn = Rotation.from_euler('xyz', TURNED_DEG, degrees=True).as_matrix()
     moved = replace(b, rotation=turn @ b.rotation, position_mm=b.position_mm + MOVED_MM)
@@ -99,7 +99,7 @@ def recording(folder: Path) -> tuple[Path, Path]:
 
 
 class Listener(Node):
-    """Counts the outputs by the number of their exposure, and heals."""
+    """Counts the outputs by exposure number, and heals the rig."""
 
     def __init__(self) -> None:
         super().__init__('listener')
@@ -110,7 +110,7 @@ class Listener(Node):
         self.heal = ActionClient(self, Heal, 'heal')
         self.accept = self.create_client(Reset, 'accept_healing')
         self.corrected: dict[str, list[int]] = {name: [] for name in NAMES}
-        self.points: dict[int, int] = {}  # number of points by that of the exposure
+        self.points: dict[int, int] = {}  # number of points, by exposure number
         self._stream = StreamReader(self, logged(self))
         for name in NAMES:
             self._stream.subscribe(
@@ -156,14 +156,14 @@ class Listener(Node):
         return future.result()
 
     def close(self) -> None:
-        """End counting."""
+        """Stop counting."""
         self._stream.stop()
         self.destroy_node()
 
 
 @contextmanager
 def started(commands: Sequence[list[str]]) -> Iterator[None]:
-    """Run processes, and end them."""
+    """Run processes, and end them on exit."""
     with open(os.environ.get('ONLINE_LOG', os.devnull), 'ab') as log:
         processes = [subprocess.Popen(each, stdout=log, stderr=log) for each in commands]
         try:
@@ -177,7 +177,7 @@ def started(commands: Sequence[list[str]]) -> Iterator[None]:
 
 
 def measure(folder: Path) -> tuple[list[tuple[str, int]], Listener]:
-    """Play the recording; return what happened after which exposure, and what was counted."""
+    """Play the recording; return the events with their exposure numbers, and the counts."""
     calibrations, orientation = rig_of_the_simulator()
     saved = folder / 'calibrations'
     save_calibrations(saved, calibrations, orientation)
@@ -212,7 +212,7 @@ def measure(folder: Path) -> tuple[list[tuple[str, int]], Listener]:
 
 
 def _heal(listener: Listener) -> list[tuple[str, int]]:
-    """Wait until shapes are learned and the rig is bumped, heal and accept; return when."""
+    """Wait until shapes are learned and the rig is bumped, heal and accept; return the events."""
     names = ', '.join(f'b{k}' for k in range(BODIES))
     learned = f'shapes of {names} learned'
     listener.wait(
@@ -239,9 +239,9 @@ def _heal(listener: Listener) -> list[tuple[str, int]]:
 
 
 def rows_of(events: list[tuple[str, int]], listener: Listener) -> list[list[str]]:
-    """Rows of the table: what was lost between the events."""
+    """Return table rows with the losses between the events."""
     out = []
-    first = min(listener.points)  # before, publishers and readers have found each other
+    first = min(listener.points)  # before that, publishers and readers discover each other
     for what, last in events:
         expected = range(first, last + 1)
         if not expected:
@@ -281,7 +281,7 @@ HEADER = 'until|frames|lost|exposures|lost|points in each'
 
 
 def main() -> None:
-    """Measure and write the section."""
+    """Run the measurements and write the section."""
     argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     isolate_ros_graph()
     rclpy.init(args=[])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Adjustment and self-calibration with independent programs, for comparison.
+"""Adjustment and self-calibration with independent programs for comparison.
 
 COLMAP's bundle adjuster (pycolmap, Ceres) with a Cauchy loss of scale b = sigma sqrt(nu) minimises
 b^2/2 sum ln(1 + |r|^2 / b^2): the negative log-likelihood of the bivariate Student-t, except for
@@ -26,28 +26,28 @@ from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 from .timing import timed
 
 PIXEL_CENTRE = 0.5
-# Standard deviations of the survey that stand for COLMAP's constant points and free points.
+# Standard deviations of the survey that represent COLMAP's constant and free points.
 HELD_SD_MM = 1e-6
 LOOSE_SD_MM = 1e6
-# Ceres stops at the first criterion that is met: here, at rounding errors.
+# Ceres stops at the first criterion that is met: here, at rounding error.
 TIGHT = {
     'function_tolerance': 0.0,
     'gradient_tolerance': 1e-10,
     'parameter_tolerance': 1e-14,
     'max_num_iterations': 500,
 }
-# Within the loop, the next round continues the adjustment.
+# Tolerances within the loop, where the next round continues the adjustment.
 LOOP = {
     'function_tolerance': 1e-8,
     'gradient_tolerance': 0.0,
     'parameter_tolerance': 0.0,
     'max_num_iterations': 100,
 }
-CANDIDATES = tuple(range(3, 50))  # values of k of Chow et al.
+CANDIDATES = tuple(range(3, 50))  # values of k in Chow et al.
 
 
 def with_datum(network: Network, held: np.ndarray) -> Network:
-    """The network with object points fixed to their survey where `held` (n,), and free elsewhere.
+    """Return the network with object points fixed to their survey where `held` (n,), else free.
 
     COLMAP supports constant and free points, but not surveyed coordinates with standard
     deviations.
@@ -58,7 +58,7 @@ def with_datum(network: Network, held: np.ndarray) -> Network:
 def drop_rarely_seen_points(
     network: Network, start: Parameters, min_exposures: int
 ) -> tuple[Network, Parameters]:
-    """Network and start values without object points seen in fewer than min_exposures."""
+    """Return network and initial values without points seen in fewer than min_exposures."""
     kept = np.bincount(network.point, minlength=len(network.survey_mm)) >= min_exposures
     rows = kept[network.point]
     number = np.cumsum(kept) - 1
@@ -77,18 +77,18 @@ def drop_rarely_seen_points(
 class ColmapAdjustment:
     """Adjustment of a network of one fluoroscope by COLMAP's bundle adjuster.
 
-    solve() may be called again after the observations changed: it continues where it ended.
+    solve() may be called again after the observations have changed; it continues where it ended.
 
     Parameters
     ----------
     network : Network
         One fluoroscope; sigma of all image points is one.
     start : Parameters
-        Start values.
+        Initial values.
     noise : Noise
         Student-t noise model; not estimated.
     held : (n,) ndarray of bool
-        Object points that stay at their survey.
+        Object points that are fixed to their survey.
     tolerances : mapping, optional
         Options of the Ceres solver.
     """
@@ -133,7 +133,7 @@ class ColmapAdjustment:
         self._options.ceres.loss_function_scale = noise.scale * np.sqrt(noise.nu)
 
     def solve(self) -> Any:
-        """Adjust, and return the summary of Ceres."""
+        """Run the adjustment and return the summary of Ceres."""
         self._adjuster = pycolmap.create_default_ceres_bundle_adjuster(
             self._options, self._config, self._reconstruction
         )
@@ -141,7 +141,7 @@ class ColmapAdjustment:
         return summary.ceres_summary
 
     def cost(self, summary: Any) -> float:
-        """F of the image points at the solution, with the constant of the distribution."""
+        """Return F of the image points at the solution, including the distribution's constant."""
         noise = self._noise
         factor = (noise.nu + 2) / (noise.nu * noise.scale**2)
         return factor * summary.final_cost + len(self._network.uv) * np.log(
@@ -149,7 +149,7 @@ class ColmapAdjustment:
         )
 
     def parameters(self) -> Parameters:
-        """Present parameters."""
+        """Return the current parameters."""
         f, cx, cy = self._reconstruction.camera(1).params
         poses = [
             self._reconstruction.image(i).cam_from_world()
@@ -165,7 +165,7 @@ class ColmapAdjustment:
         )
 
     def interior_covariance(self) -> np.ndarray:
-        """Covariance (3, 3) [px^2] of xp, yp, c from the weighted normal matrix, after solve()."""
+        """Return the covariance (3, 3) [px^2] of xp, yp, c from the weighted normal matrix."""
         options = pycolmap.BACovarianceOptions()
         options.params = pycolmap.BACovarianceOptionsParams.ALL
         options.damping = 0.0
@@ -174,12 +174,12 @@ class ColmapAdjustment:
         covariance = found.get_other_params_cov(self._reconstruction.camera(1).params)[
             np.ix_(order, order)
         ]
-        # Ceres weights by 1/(1 + |r|^2/b^2), the likelihood by (nu + 2)/b^2 times that.
+        # Ceres weights by 1/(1 + |r|^2/b^2), the likelihood by (nu + 2)/b^2 times this weight.
         return covariance * self._noise.nu * self._noise.scale**2 / (self._noise.nu + 2)
 
 
 def _options(noise: Noise, tolerances: Mapping[str, float]) -> Any:
-    """Options of COLMAP's bundle adjuster: everything is refined, on one thread."""
+    """Return options of COLMAP's bundle adjuster: refine everything, on one thread."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     options.print_summary = False
@@ -192,7 +192,7 @@ def _options(noise: Noise, tolerances: Mapping[str, float]) -> Any:
 
 
 def _reconstruction(network: Network, start: Parameters, held: np.ndarray) -> Any:
-    """COLMAP's reconstruction with camera 1, and images and points numbered from 1 in order."""
+    """Return a COLMAP reconstruction: camera 1, images and points numbered from 1 in order."""
     xp, yp, c = start.interior[0]
     size = np.ceil(network.uv.max(axis=0)).astype(int) + 1
     out = pycolmap.Reconstruction()
@@ -216,7 +216,7 @@ def _reconstruction(network: Network, start: Parameters, held: np.ndarray) -> An
             image, pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ position]))
         )
     first = np.searchsorted(network.exposure, np.arange(len(start.rotation)))
-    number = np.arange(len(network.uv)) - first[network.exposure]  # of the point in its image
+    number = np.arange(len(network.uv)) - first[network.exposure]  # index in its image
     xyz = np.where(held[:, None], network.survey_mm, start.points_mm)
     order = np.argsort(network.point, kind='stable')
     starts = np.searchsorted(network.point[order], np.arange(len(xyz) + 1))
@@ -265,12 +265,12 @@ def self_calibrate_with_peers(
     rounds: int = 30,
     settled_px: float = 2e-3,
 ) -> PeerCalibration:
-    """The loop of Chow et al. made of COLMAP's bundle adjuster and scikit-learn's grid search.
+    """Run the loop of Chow et al. with COLMAP's bundle adjuster and scikit-learn's grid search.
 
-    What does not change is built once: the reconstruction, which each adjustment continues from,
-    and the folds. The datum are object points seen in less than three exposures, and every tenth.
-    As ours, the loop ends when the next round would change the correction by less than settled_px,
-    or after `rounds`.
+    The folds and the reconstruction, from which each adjustment continues, are built once. The
+    datum is defined by object points seen in fewer than three exposures, and every tenth point.
+    Like ours, the loop ends when the next round would change the correction by less than
+    settled_px, or after `rounds`.
     """
     network, start = drop_rarely_seen_points(network, start, 2)
     held = (np.arange(len(network.survey_mm)) % 10 == 0) | (np.bincount(network.point) < 3)
@@ -324,7 +324,7 @@ def self_calibrate_with_peers(
 def _without_gauge(
     uv: np.ndarray, fitted: np.ndarray, inliers: np.ndarray, interior: np.ndarray
 ) -> np.ndarray:
-    """The fitted correction (N, 2) without its gauge part; otherwise c would drift."""
+    """Return the fitted correction (N, 2) without its gauge component; otherwise c would drift."""
     basis = gauge_basis(uv, interior)
     part, *_ = np.linalg.lstsq(
         basis[inliers].reshape(-1, basis.shape[2]), fitted[inliers].ravel(), rcond=None

@@ -3,10 +3,10 @@
 
 """Errors of many simulated calibrations relative to their stated standard deviations.
 
-Every calibration has a rig of its own. Errors are computed against the truth in the gauge of the
+Every calibration has its own rig. Errors are relative to the truth in the gauge of the
 calibration: a shift, scale or rotation of the whole image can be part of the orientation or of the
 distortion, so the true distortion is transformed by the projective map that makes it orthogonal to
-the gauge, as the estimated one is.
+the gauge, like the estimated one.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from fluoro_calib_ros.simulation.rig import (
 from tools.sections import write_section
 
 QUANTITIES = ('xp', 'yp', 'c', 'T', 'q', 'object points')
-MARGIN_PX = 8.0  # of the grid from the edge of the image
+MARGIN_PX = 8.0  # distance of the grid from the edge of the image
 
 
 class Fluoroscope(Protocol):
-    """What is true of a fluoroscope: its interior orientation (3,) [px] and its distortion."""
+    """True interior orientation (3,) [px] and distortion of a fluoroscope."""
 
     @property
     def interior(self) -> np.ndarray:
@@ -59,11 +59,11 @@ def truth_in_gauge(
     interior: np.ndarray,
     fitted: np.ndarray | float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """True interior orientation, sensor rotation and correction in the gauge of a calibration.
+    """Return true interior orientation, sensor rotation and correction in a calibration's gauge.
 
     uv (n, 2) are the image points over which its correction is orthogonal to the gauge, interior
-    (3,) is its interior orientation [px]. Where it is not orthogonal, fitted (n, 2) are its
-    corrections of these points [px]: the true ones get the same part in the gauge.
+    (3,) is its interior orientation [px]. If it is not orthogonal, fitted (n, 2) are its
+    corrections of these points [px]; the true ones get the same component in the gauge.
     """
 
     def camera(k: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ def truth_in_gauge(
 
 
 def normalised(seed: int, exposures: int = 15, model: str = 'auto') -> dict[str, float]:
-    """Errors of one calibration; see errors_of."""
+    """Return the errors of one calibration; see errors_of."""
     rig = virtual_rig(seed)
     simulated = simulate_exposures(rig, exposures, seed, detection=Detection(beads=(125, 139)))
     return errors_of(
@@ -99,10 +99,10 @@ def normalised(seed: int, exposures: int = 15, model: str = 'auto') -> dict[str,
 def errors_of(
     job: CalibrationResult, rig: VirtualRig, simulated: SimulatedExposures
 ) -> dict[str, float]:
-    """Mean normalised squared errors of a calibration of fluoroscope a, by quantity.
+    """Return mean normalised squared errors of a calibration of fluoroscope a, by quantity.
 
-    Also 'interval', the fraction of the correction within its 95 % interval, and 'correction', its
-    RMSE [px].
+    Also return 'interval', the fraction of the correction within its 95 % interval, and
+    'correction', its RMSE [px].
     """
     run = job.runs['a']
     figures = job.fluoroscopes['a']

@@ -15,7 +15,7 @@ HEADER = ['function', 'calls', 'cumulative', 'share', 'own']
 
 
 def rows(function: Callable[[], object], count: int = 12) -> Iterator[list[str]]:
-    """Table rows of the package's functions with the largest cumulative times during a call."""
+    """Yield table rows of the package functions with the largest cumulative times in a call."""
     profile = cProfile.Profile()
     profile.runcall(function)
     # (file, line, name) -> (primitive calls, calls, own time, cumulative time, callers)
@@ -34,7 +34,7 @@ def rows(function: Callable[[], object], count: int = 12) -> Iterator[list[str]]
 
 
 def _qualified_name(key: tuple[str, int, str]) -> str:
-    """Module and name of a function of the package; an empty string for all others."""
+    """Return module and name of a function of the package, '' for all other functions."""
     file, _, name = key
     path = Path(file)
     if PACKAGE not in path.parents or name.startswith('<'):

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How far the errors of a correction reach over the image.
+"""Correlation length of the errors of a correction in the image.
 
-Shapes of bodies are learned from markers that move: their errors by the correction average out
-over this distance (see `bodies.correction_errors`). Writes a section of docs/how_good.md:
+Shapes of bodies are learned from moving markers, whose correction errors average out over this
+distance (see `bodies.correction_errors`). Writes a section of docs/how_good.md:
 python -m benchmarks.reach --rigs 8
 """
 
@@ -26,11 +26,11 @@ from .models import GRID_PX, NAME, TRAIN_EXPOSURES, correction_errors, make_scen
 
 MODELS = ('auto', 'local_linear', 'knn')
 SIDE_PX = 1024
-STEPS = np.array([1, 3, 6, 10, 16, 24])  # distances, in spacings of the grid
+STEPS = np.array([1, 3, 6, 10, 16, 24])  # distances, in grid spacings
 
 
 def correlations(model: str, rigs: int) -> np.ndarray:
-    """Correlations (k,) of the errors at two pixels in a line or column, by their distance."""
+    """Return correlations (k,) of the errors at two pixels in a row or column, by distance."""
     products = np.zeros(len(STEPS) + 1)
     count = np.zeros(len(STEPS) + 1)
     for seed in range(1, rigs + 1):
@@ -65,7 +65,7 @@ of {side} pixels. Learning of shapes and healing assume exp(-distance / {reach:.
 
 
 def main() -> None:
-    """Measure and write the section."""
+    """Run the measurements and write the section."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--rigs', type=int, default=8)
     arguments = parser.parse_args()

@@ -42,8 +42,9 @@ from fluoro_calib_ros.simulation.rig import (
 EXPOSURES = 15
 NOISE_PX = 0.25
 CAPTURED = 1
-CLUSTERS = np.arange(24).reshape(4, 6)  # rows of the markers of each rigid cluster
-# Around images without distortion: a point at the edge leaves the image without its distortion.
+CLUSTERS = np.arange(24).reshape(4, 6)  # marker rows of each rigid cluster
+# Margin around undistorted images: without its distortion, a point at the edge may leave the
+# image.
 MARGIN_PX = 100
 WAYS = {
     'uncorrected': 'none',
@@ -56,25 +57,25 @@ FROM_EXPOSURES = ', orientation from the calibration'
 
 @dataclass(frozen=True)
 class Outcome:
-    """Results of one way on one rig.
+    """Results of one method on one rig.
 
     Attributes
     ----------
     rmse_mm : float
-        Of the markers, 3-D.
+        3-D RMSE of the markers.
     normalised : float
-        Mean normalised squared error, NaN for a rig frame that is not the true one.
+        Mean normalised squared error; NaN if the rig frame differs from the true one.
     epipolar : float
         Mean squared standardised epipolar distance.
     lost : float
         Fraction of the points without coordinates.
     constancy : ndarray
-        (4,), standard deviation over time of the distances in each cluster, over the predicted
-        one.
+        (4,), standard deviation over time of the distances in each cluster, relative to the
+        predicted one.
     distance_mm : float
         RMSE of these distances.
     sd_orientation_mm : float
-        Of the points due to the orientation of the rig, 3-D; NaN like `normalised`.
+        3-D, of the points, due to the orientation of the rig; NaN like `normalised`.
     """
 
     rmse_mm: float
@@ -87,7 +88,7 @@ class Outcome:
 
 
 def capture(rig: VirtualRig, seed: int, count: int = CAPTURED) -> dict[str, list[Frame]]:
-    """Return {fluoroscope: [Frame, ...]} of the phantom in the rig frame, count frames of each."""
+    """Return {fluoroscope: [Frame, ...]} with count frames of the phantom in the rig frame."""
     rng = np.random.default_rng([seed, 4])
     return {
         f.name: [
@@ -104,7 +105,7 @@ def capture(rig: VirtualRig, seed: int, count: int = CAPTURED) -> dict[str, list
 
 
 def undistorted(rig: VirtualRig, frames: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
-    """Remove the true distortion from frames; the images get a margin."""
+    """Remove the true distortion from frames, and add a margin to the images."""
     field = {f.name: f.distortion for f in rig.fluoroscopes}
     return {
         name: [
@@ -129,9 +130,9 @@ def measure(
     rate_hz: float = 60.0,
     captured: int = CAPTURED,
 ) -> dict[str, Outcome]:
-    """Outcomes of one virtual rig, by way.
+    """Return the outcomes of a virtual rig, by method.
 
-    Each way also comes with the orientation from the exposures of the calibration.
+    Each method is also evaluated with the orientation from the exposures of the calibration.
     """
     rig = virtual_rig(seed)
     out = {}
@@ -162,7 +163,7 @@ def measure(
 def _outcome(
     found: Sequence[ReconstructedFrame], truth: np.ndarray, in_rig_frame: bool
 ) -> Outcome:
-    """Outcome of ReconstructedFrames against the true points (frames, n, 3) [mm]."""
+    """Compare ReconstructedFrames with the true points (frames, n, 3) [mm]."""
     xyz, covariance, noise, standardised = (
         np.array([getattr(frame.points, name) for frame in found])
         for name in ('xyz_mm', 'covariance', 'covariance_noise', 'standardised')
@@ -201,7 +202,7 @@ def _outcome(
 
 
 def _fitted(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Points (n, 3) moved as a rigid body onto the truth (Kabsch 1976), for another rig frame."""
+    """Fit points (n, 3) to the truth by a rigid motion (Kabsch 1976), if rig frames differ."""
     a = points.mean(axis=0)
     b = truth.mean(axis=0)
     left, _, right = np.linalg.svd((points - a).T @ (truth - b))
@@ -210,9 +211,9 @@ def _fitted(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _distances(xyz: np.ndarray, truth: np.ndarray, noise: np.ndarray) -> tuple[float, float]:
-    """Constancy and RMSE [mm] of the distances in a rigid cluster (frames, k, 3).
+    """Return constancy and RMSE [mm] of the distances in a rigid cluster (frames, k, 3).
 
-    Constancy is the standard deviation over time over the predicted one.
+    Constancy is the standard deviation over time relative to the predicted one.
     """
     one, other = np.triu_indices(xyz.shape[1], 1)
     apart = xyz[:, one] - xyz[:, other]
@@ -228,7 +229,7 @@ def _distances(xyz: np.ndarray, truth: np.ndarray, noise: np.ndarray) -> tuple[f
 
 
 def table(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
-    """Markdown table of {way: [Outcome of every rig]}.
+    """Return a Markdown table of {method: [Outcome of every rig]}.
 
     Squares are averaged over the rigs; +- is the standard error.
     """
@@ -261,7 +262,7 @@ def table(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
 
 
 def cluster_table(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
-    """Markdown table of the constancy of the distances, by cluster."""
+    """Return a Markdown table of the constancy of the distances, by cluster."""
     lines = [
         '| correction | '
         + ' | '.join(f'cluster {k + 1}' for k in range(len(CLUSTERS)))
@@ -283,7 +284,7 @@ def _rms(values: ArrayLike) -> float:
 
 
 def speed(points: int = 30, repeats: int = 2000) -> float:
-    """Time [s] of one intersection of points in two views, the least of ten means."""
+    """Return the time [s] to intersect points of two views, the minimum of ten means."""
     rig = virtual_rig(1)
     calibrations = calibrate(
         simulate_exposures(rig, 5, 1).frames, rig.phantom, CalibrationOptions('parametric')
@@ -303,7 +304,7 @@ def speed(points: int = 30, repeats: int = 2000) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point: the tables on standard output."""
+    """Entry point: print the tables."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks.reconstruction', description=__doc__
     )

@@ -6,9 +6,10 @@
     python -m benchmarks.recording [--seconds 60] [--depth 100 30] [--profile FILE]
 
 2 x 250 Hz with 30 markers and 2 x 30 Hz images of 1024 x 1024 mono8, from one publisher process to
-the recorder on the same machine. Each message has a number, and is lost if the bag does not hold
-it. depth: of the publishers of frames and images. profile: of Fast DDS, for both processes. Late
-is how far the publisher was behind its schedule: then the machine was too busy for the test.
+the recorder on the same machine. Each message has a number, and is lost if the bag does not
+contain it. depth: queue depths of the publishers of frames and images. profile: Fast DDS profile
+of both processes. Late is the delay of the publisher: if large, the machine was too busy for the
+test.
 """
 
 from __future__ import annotations
@@ -43,13 +44,14 @@ from .timing import table
 FRAMES_HZ = 250.0
 IMAGES_HZ = 30.0
 SIZE = 1024
-# Where the number of a message is in its bytes: a stamp of its own, the first field of all.
+# Position of the message number in the bytes: it replaces the stamp, the first field of every
+# type.
 STAMP = slice(4, 8)
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def publish(seconds: float, depths: tuple[int, int]) -> None:
-    """Publish at the rates, and print what was sent and how late it was."""
+    """Publish at the rates; print the numbers of sent messages and the largest delay."""
     rclpy.init(args=[])
     node = rclpy.create_node('rig')
     spinner = SingleThreadedExecutor()
@@ -98,7 +100,7 @@ def publish(seconds: float, depths: tuple[int, int]) -> None:
 
 
 def record(seconds: float, depths: tuple[int, int], profile: Path | None) -> list[str]:
-    """Record what another process publishes; returns a row of the table."""
+    """Record the messages that another process publishes; return a row of the table."""
     if profile is not None:
         os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Gain by joint adjustment and relative orientation constraint: `python -m benchmarks.relative`.
+"""Gain from joint adjustment and relative orientation constraint: `python -m benchmarks.relative`.
 
-The fluoroscopes of virtual rigs see the phantom in the same pose in every exposure. Errors are
-those of other exposures, adjusted with the calibration held fixed (adjust_with_calibrations),
-against the truth of the rig.
+In every exposure, the fluoroscopes of a virtual rig see the phantom in the same pose. Errors refer
+to the truth, for other exposures adjusted with fixed calibrations (adjust_with_calibrations).
 """
 
 import argparse
@@ -70,7 +69,7 @@ def measure(
     method: str,
     model: str,
 ) -> Gain:
-    """Gain of one calibration method from training exposures, on test exposures."""
+    """Return the gain of one calibration method from training exposures, on test exposures."""
     joint, relative = METHODS[method]
     began = time.perf_counter()
     job = calibrate(
@@ -103,14 +102,14 @@ def measure(
 
 
 def _rms(errors: np.ndarray) -> float:
-    """Root mean square length of errors (n, 3)."""
+    """Return the root mean square length of errors (n, 3)."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 
 def simulate_flexible_rig(
     rig: VirtualRig, count: int, seed: int, flex_mm: float = 0.0, flex_rad: float = 0.0
 ) -> SimulatedExposures:
-    """Exposures of a rig whose last fluoroscope moves between exposures.
+    """Simulate exposures of a rig whose last fluoroscope moves between exposures.
 
     flex_mm and flex_rad: standard deviations of its position and attitude.
     """
@@ -141,9 +140,9 @@ def compare(
     flex: tuple[float, float] = (0.0, 0.0),
     progress: TextIO = sys.stderr,
 ) -> dict[tuple[int, str], list[Gain]]:
-    """Gains {(count, method): [Gain of every seed]}.
+    """Return gains {(count, method): [Gain of every seed]}.
 
-    flex [mm, rad]: standard deviations of the rig while it is calibrated.
+    flex [mm, rad]: standard deviations of the rig motion during calibration.
     """
     out: dict[tuple[int, str], list[Gain]] = {}
     for seed in seeds:
@@ -163,7 +162,7 @@ def compare(
 
 
 def table(gains: Mapping[tuple[int, str], Sequence[Gain]]) -> str:
-    """Markdown table of the result of compare: root mean squares over the rigs."""
+    """Return a Markdown table of the result of compare: root mean squares over the rigs."""
     lines = [
         '| exposures | adjustment | object points, 3-D [mm] | sources, 3-D [mm] | distance of the '
         'sources [mm] | sd of c [px] | time [s] |',

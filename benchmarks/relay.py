@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A node that only relays target observations: the cost of rclpy and DDS without any work.
+"""A node that only relays target observations: the cost of rclpy and DDS without other work.
 
 python -m benchmarks.relay plain     ordinary subscriptions in rclpy's executor
 python -m benchmarks.relay streams   received as the nodes of this package receive streams
@@ -29,7 +29,7 @@ from fluoro_calib_ros.nodes.runtime.topics import observations_qos
 
 
 class Relay(ManagedNode):
-    """Republish <fluoroscope>/target_observations on <fluoroscope>/relayed_KIND."""
+    """Republishes <fluoroscope>/target_observations on <fluoroscope>/relayed_KIND."""
 
     def __init__(self, kind: str) -> None:
         super().__init__(f'relay_{kind}')
@@ -38,7 +38,7 @@ class Relay(ManagedNode):
         self._latencies = {name: LatencyWindow() for name in 'ab'}
 
     def activate(self) -> None:
-        """Begin to relay."""
+        """Start to relay."""
         self._reader = StreamReader(self, all_fatal(self))
         for name in 'ab':
             topic = f'{name}/target_observations'
@@ -82,7 +82,7 @@ class Relay(ManagedNode):
 
 
 def all_fatal(node: ManagedNode) -> FaultHandlers:
-    """End a benchmark's node at any fault."""
+    """Return handlers that end a benchmark's node at any fault."""
     return FaultHandlers(
         node.fail, lambda topic, error: node.fail(f'{topic}: {error!r}'), node.fail
     )

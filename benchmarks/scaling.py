@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Time and memory of an adjustment by number of exposures, each size in its own process.
+"""Time and memory of an adjustment by number of exposures, with one process per size.
 
 python -m benchmarks.scaling 300      one size; prints one line of JSON
 """
@@ -35,9 +35,9 @@ HEADER = [
 
 
 def peak_gib() -> float:
-    """Largest resident size of this process so far [GiB]."""
-    # ru_maxrss of getrusage starts at that of the parent process, which is larger than the small
-    # sizes here.
+    """Return the peak resident memory of this process so far [GiB]."""
+    # The ru_maxrss of getrusage starts at the value of the parent process, which exceeds the
+    # memory of the small sizes here.
     status = dict(
         line.split(':', 1) for line in Path('/proc/self/status').read_text().splitlines()
     )
@@ -45,7 +45,7 @@ def peak_gib() -> float:
 
 
 def measure(exposures: int) -> dict[str, Any]:
-    """Figures of one adjustment from disturbed start values in this process."""
+    """Measure an adjustment from disturbed initial values in this process."""
     network, start = large_network(exposures)
     before = peak_gib()
     with threadpool_limits(1):
@@ -64,7 +64,7 @@ def measure(exposures: int) -> dict[str, Any]:
 
 
 def measure_in_new_process(exposures: int) -> dict[str, Any]:
-    """The same in a new process, so that its memory is that of this adjustment."""
+    """Measure in a new process, so that its memory is that of this adjustment."""
     done = subprocess.run(
         [sys.executable, '-m', 'benchmarks.scaling', str(exposures)],
         stdout=subprocess.PIPE,
@@ -75,7 +75,7 @@ def measure_in_new_process(exposures: int) -> dict[str, Any]:
 
 
 def rows(sizes: Sequence[int] = SIZES) -> Iterator[list[str]]:
-    """Table rows of all sizes."""
+    """Yield the table rows of all sizes."""
     for size in sizes:
         f = measure_in_new_process(size)
         step = f['seconds'] / f['steps']

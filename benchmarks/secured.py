@@ -5,10 +5,10 @@
 
 python -m benchmarks.secured KEYSTORE [--foreign KEYSTORE]
 
-KEYSTORE is made as docs/reliability.md says; the ROS of this environment must have a Fast DDS with
-its security plugins. Calibrates from bags/calibration and reconstructs bags/tracking with each
-node in its enclave; then tries to publish a calibration from the enclave of the player, without
-keys, and with keys of another authority.
+KEYSTORE is created as described in docs/reliability.md; the ROS of this environment must have a
+Fast DDS with security plugins. Calibrates from bags/calibration and reconstructs bags/tracking
+with each node in its enclave; then tries to publish a calibration from the enclave of the player,
+without keys, and with keys of another authority.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sensor_msgs.msg import PointCloud2
 from .faults.processes import ROOT, Process, node
 
 TIMEOUT_S = 60.0
-LOG_LENGTH = 2000  # characters that are shown of each log after a failure
+LOG_LENGTH = 2000  # characters of each log that are shown after a failure
 INTRUDER = """
 import sys, time
 import rclpy
@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def run(folder: Path, foreign: Path | None) -> Iterator[str]:
-    """Run the graph, then the intruders; returns lines of the report."""
+    """Run the graph, then the intruders; yield lines of the report."""
     rig = {'phantom': ROOT / 'bags' / 'phantom.csv'}
     with ExitStack() as stack:
         start = _Starter(folder, stack)
@@ -86,7 +86,7 @@ def run(folder: Path, foreign: Path | None) -> Iterator[str]:
         yield f'exposures collected: {operator.collected}'
         answer = operator.calibrate()
         yield f'calibrate: {answer.success}, {answer.message}'
-        # Again and again: the first frames may come before the calibrations do.
+        # Loop, because the first frames may precede the calibrations.
         bag = {'bag': ROOT / 'bags' / 'tracking', 'wait_for_readers': 2, 'loop': 'true'}
         start('player_node', bag)
         operator.wait(lambda: operator.exposures >= 100, 'points in space')
@@ -102,7 +102,7 @@ def run(folder: Path, foreign: Path | None) -> Iterator[str]:
 
 
 def _intruders(foreign: Path | None) -> Iterator[tuple[str, Mapping[str, str], str]]:
-    """Return title, environment and enclave of those that publish a calibration."""
+    """Yield title, environment and enclave of the processes that try to publish a calibration."""
     yield 'enclave of the player', {}, '/fluoro/player_node'
     yield 'no keys', {'ROS_SECURITY_ENABLE': 'false'}, '/fluoro/calibration_node'
     if foreign is not None:
@@ -119,7 +119,7 @@ def _enforced(keystore: Path) -> dict[str, str]:
 
 @contextmanager
 def _environment(settings: Mapping[str, str]) -> Iterator[None]:
-    """Set variables of the environment for the processes that are started meanwhile."""
+    """Set environment variables for the processes that are started within this context."""
     before = dict(os.environ)
     os.environ.update(settings)
     try:
@@ -146,7 +146,7 @@ class _Starter:
 
 @dataclass
 class _Operator:
-    """Who calls the services, in the enclave of the operator."""
+    """A user who calls the services, in the enclave of the operator."""
 
     node: rclpy.node.Node
     executor: SingleThreadedExecutor
@@ -174,7 +174,7 @@ class _Operator:
         return answer.result()
 
     def wait(self, condition: Callable[[], object], what: str) -> None:
-        """Spin until a condition is true. Raises TimeoutError."""
+        """Spin until a condition is true. Raise TimeoutError after the deadline."""
         end = time.monotonic() + TIMEOUT_S
         while not condition():
             if time.monotonic() > end:

@@ -8,8 +8,8 @@
 The phantom in hand is 0.3 % larger than its drawing, and its beads lie 1 mm from it in each
 coordinate. Three distances between beads are measured with a standard deviation of 0.02 mm. Then
 calibrations with the true coordinates, the surveyed ones and those of the drawing, from other
-exposures, reconstruct the beads in exposures that none of them used: their distances from each
-other have errors that no choice of a frame takes up.
+exposures, reconstruct the beads in exposures that none of them used. Errors of the distances
+between beads do not depend on the choice of a frame.
 """
 
 import argparse
@@ -34,16 +34,16 @@ from tools.sections import show_section
 
 GROWN = 1.003
 DRAWING_SD_MM = 1.0
-CLAIMED_SD_MM = 0.1  # of the drawing that is taken for a survey
+CLAIMED_SD_MM = 0.1  # stated for the drawing if it is taken for a survey
 CALIPER_SD_MM = 0.02
 DISTANCES = 3
-FROM_MM = 150.0  # between the beads whose distance is measured
+FROM_MM = 150.0  # minimum distance between the beads of a measured distance
 EXACT_SD_MM = 1e-3
-OTHERS = 500  # added to the seed of exposures
+OTHERS = 500  # offset of the seed of other exposures
 TESTED = 900
 BLOCK = Drawing(4, 4, 4, pitch_mm=(45.0, 45.0, 45.0))
 SMALL_BLOCK = Drawing(3, 3, 2, pitch_mm=(60.0, 60.0, 80.0))
-# Phantom, exposures, fluoroscopes.
+# Drawing of the phantom, exposures, fluoroscopes.
 CASES = (
     (None, 15, 2),
     (None, 30, 2),
@@ -57,7 +57,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class Case:
-    """A phantom in hand, its drawing, its exposures and its measured distances."""
+    """An actual phantom, its drawing, its exposures and its measured distances."""
 
     rig: VirtualRig
     drawing: Phantom
@@ -66,7 +66,7 @@ class Case:
 
 
 def case(drawn: Drawing | None, seed: int, exposures: int, fluoroscopes: int) -> Case:
-    """Draw a case at random; drawn: by default the phantom of the rig."""
+    """Draw a random case; drawn: drawing of the phantom, by default the phantom of the rig."""
     rng = np.random.default_rng([seed, 9])
     rig = virtual_rig(seed, names=('a', 'b')[:fluoroscopes])
     if drawn is not None:
@@ -90,7 +90,7 @@ def case(drawn: Drawing | None, seed: int, exposures: int, fluoroscopes: int) ->
 
 
 def errors(beads: SurveyedBeads, rig: VirtualRig) -> tuple[np.ndarray, float]:
-    """Errors (n, 3) [mm] of beads after a rigid motion, and that of their scale."""
+    """Return errors (n, 3) [mm] of beads after a rigid motion, and their relative scale error."""
     true = rig.true_mm[rig.phantom.index(beads.target_id)]
     true = true - true.mean(axis=0)
     found = beads.xyz_mm - beads.xyz_mm.mean(axis=0)
@@ -101,7 +101,7 @@ def errors(beads: SurveyedBeads, rig: VirtualRig) -> tuple[np.ndarray, float]:
 
 
 def figures(one: Case, outcome: SurveyOutcome) -> dict[str, float]:
-    """Figures of a survey."""
+    """Return the figures of a survey."""
     beads = outcome.beads
     off, scale = errors(beads, one.rig)
     square = np.einsum('na,nab,nb->', off, np.linalg.inv(beads.covariance), off)
@@ -122,7 +122,7 @@ def figures(one: Case, outcome: SurveyOutcome) -> dict[str, float]:
 def out_of_sample(
     one: Case, phantom: Phantom, frames: Mapping[str, Sequence[Frame]], seed: int
 ) -> float:
-    """RMS error [mm] of distances in unused exposures; NaN where the calibration is refused."""
+    """Return RMS error [mm] of distances in unused exposures; NaN if calibration is refused."""
     test = simulate_exposures(one.rig, 20, seed + TESTED, Detection(false_matches=0)).frames
     try:
         outcome = run_calibration(CalibrationRequest(frames, phantom, joint=True))
@@ -148,7 +148,7 @@ def out_of_sample(
 
 
 def compared(seed: int) -> dict[str, float]:
-    """Out-of-sample errors [mm] by coordinates of the phantom."""
+    """Return out-of-sample errors [mm] by source of the phantom coordinates."""
     one = case(None, seed, 15, 2)
     count = len(one.rig.true_mm)
     request = SurveyRequest(one.frames, one.drawing, one.distances, keep_given=True)
@@ -168,7 +168,7 @@ def compared(seed: int) -> dict[str, float]:
 
 
 def row(seeds: Iterable[int], drawn: Drawing | None, exposures: int, fluoroscopes: int) -> str:
-    """Row of the table of a case."""
+    """Return the table row of a case."""
     found = []
     for seed in seeds:
         one = case(drawn, seed, exposures, fluoroscopes)
@@ -188,7 +188,7 @@ def row(seeds: Iterable[int], drawn: Drawing | None, exposures: int, fluoroscope
 
 
 def section(seeds: int) -> str:
-    """The section of docs/how_good.md."""
+    """Return the section of docs/how_good.md."""
     lines = [
         '## Survey of a phantom',
         '',

@@ -5,11 +5,11 @@
 
     python -m benchmarks.targets [--seeds 5] [--case NAME]
 
-Each case calibrates fluoroscope a of a virtual rig from its targets, and adjusts 40 exposures of
-the phantom that it has not used, with interior orientation and correction held. The errors of
-their object points and of the correction stand beside those of the same case with the distortion
-perfectly known: the true one is taken off the image points, and the interior orientation estimated
-from the same exposures.
+Each case calibrates fluoroscope a of a virtual rig from its targets, and adjusts 40 unused
+exposures of the phantom with fixed interior orientation and correction. The errors of their object
+points and of the correction are compared with those of the same case with known distortion: the
+true distortion is removed from the image points, and the interior orientation is estimated from
+the same exposures.
 """
 
 import argparse
@@ -46,12 +46,12 @@ from fluoro_calib_ros.simulation.rig import (
 GRID_IDS = 1000  # first id of the grid
 TESTED = 40
 TEST_SEED = 77
-POINT_SD_MM = 0.1  # of markers whose coordinates are known
+POINT_SD_MM = 0.1  # for markers with known coordinates
 WEAK_SURVEY = 10.0
 
 
 def grid_points(columns: int = 17, rows: int = 17, spacing_mm: float = 18.0) -> np.ndarray:
-    """Points (n, 3) [mm] of a flat grid in the plane z = 0."""
+    """Return points (n, 3) of a flat grid in the plane z = 0."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows), indexing='ij')
     middle = np.array([columns - 1, rows - 1]) / 2
     flat = (np.column_stack([x.ravel(), y.ravel()]) - middle) * spacing_mm
@@ -65,15 +65,15 @@ def facing(
     depth_mm: float = 0.0,
     shift_mm: float = 60.0,
 ) -> Pose:
-    """Pose of a plane before a fluoroscope: rotation and shift [mm] into the rig frame.
+    """Return the pose of a plane before a fluoroscope: rotation and shift [mm] to the rig frame.
 
-    Tilted by an angle about an axis drawn at random, turned about its normal at random.
+    The plane is tilted by an angle about a random axis, and rotated about its normal at random.
     """
     about = rng.uniform(0, 2 * np.pi)
     tilt = matrix_from_vector(np.deg2rad(tilt_deg) * np.array([np.cos(about), np.sin(about), 0]))
     turn = matrix_from_vector([0, 0, rng.uniform(0, 2 * np.pi)])
     in_sensor = np.append(rng.uniform(-shift_mm, shift_mm, 2), depth_mm)
-    middle = -fluoroscope.rotation @ fluoroscope.position_mm  # the origin of the rig
+    middle = -fluoroscope.rotation @ fluoroscope.position_mm  # the origin of the rig frame
     place = fluoroscope.rotation.T @ (middle + in_sensor) + fluoroscope.position_mm
     return fluoroscope.rotation.T @ tilt @ turn, place
 
@@ -85,7 +85,7 @@ def grid_frames(
     seed: int,
     detection: Detection | None = None,
 ) -> list[Frame]:
-    """Exposures of a grid."""
+    """Simulate exposures of a grid."""
     rng = np.random.default_rng([seed, 5])
     ids = GRID_IDS + np.arange(len(points))
     frames = []
@@ -96,7 +96,7 @@ def grid_frames(
 
 
 def without_distortion(frames: Sequence[Frame], fluoroscope: VirtualFluoroscope) -> list[Frame]:
-    """The frames with the true distortion taken off."""
+    """Return the frames with the true distortion removed."""
     out = []
     for frame in frames:
         uv = frame.uv - fluoroscope.distortion(frame.uv)
@@ -106,14 +106,14 @@ def without_distortion(frames: Sequence[Frame], fluoroscope: VirtualFluoroscope)
 
 
 def grid_survey(points: np.ndarray, sd_mm: float = 0.05, seed: int = 0) -> Phantom:
-    """A Phantom of the grid, its survey with errors."""
+    """Return a Phantom of the grid with survey errors."""
     rng = np.random.default_rng([seed, 6])
     survey = points + rng.normal(0, sd_mm, points.shape)
     return Phantom(GRID_IDS + np.arange(len(points)), survey, np.full(len(points), sd_mm))
 
 
 def both(one: Phantom, other: Phantom) -> Phantom:
-    """A phantom of the targets of two; their ids differ."""
+    """Combine the targets of two phantoms, whose ids differ."""
     return Phantom(
         np.concatenate([one.target_id, other.target_id]),
         np.concatenate([one.xyz_mm, other.xyz_mm]),
@@ -132,7 +132,7 @@ class Case:
     known: dict[str, KnownOrientation] = field(default_factory=dict)
 
     def request(self, frames: Sequence[Frame], **options: Any) -> CalibrationRequest:
-        """CalibrationRequest with these frames."""
+        """Return the CalibrationRequest for these frames."""
         return CalibrationRequest(
             {'a': frames},
             self.phantom,
@@ -145,7 +145,7 @@ class Case:
 def tilted_grid(
     rig: VirtualRig, seed: int, count: int = 15, max_tilt: float = 40.0, **detection: Any
 ) -> Case:
-    """A grid in tilted poses."""
+    """Simulate a grid in tilted poses."""
     fluoroscope = rig.fluoroscopes[0]
     rng = np.random.default_rng([seed, 7])
     points = grid_points()
@@ -156,7 +156,7 @@ def tilted_grid(
 
 
 def grid_on_intensifier(rig: VirtualRig, seed: int, count: int = 6) -> Case:
-    """A grid that lies on the image intensifier and is shifted and turned; c is given."""
+    """Simulate a grid that is shifted and rotated on the image intensifier; c is given."""
     fluoroscope = rig.fluoroscopes[0]
     rng = np.random.default_rng([seed, 8])
     points = grid_points(23, 23)
@@ -167,7 +167,7 @@ def grid_on_intensifier(rig: VirtualRig, seed: int, count: int = 6) -> Case:
 
 
 def small_cube(rig: VirtualRig, seed: int, count: int = 15) -> Case:
-    """Exposures of a cube of half the size, which leaves the rim of the image uncovered."""
+    """Simulate a cube of half the size, which leaves the rim of the image uncovered."""
     chosen = np.sort(np.random.default_rng([seed, 9]).permutation(len(rig.true_mm))[:64])
     survey = rig.phantom
     true = 0.5 * rig.true_mm[chosen]
@@ -182,7 +182,7 @@ def small_cube(rig: VirtualRig, seed: int, count: int = 15) -> Case:
 
 
 def cube_and_grid(rig: VirtualRig, seed: int) -> Case:
-    """The small cube, and three exposures of a grid on the image intensifier."""
+    """Combine the small cube with three exposures of a grid on the image intensifier."""
     cube = small_cube(rig, seed)
     grid = grid_on_intensifier(rig, seed, 3)
     shifted = [replace(f, number=f.number + 100) for f in grid.frames]
@@ -196,13 +196,13 @@ def known_orientation(
     targets: int = 12,
     sd: tuple[tuple[float, float, float], tuple[float, float]] | None = None,
 ) -> Case:
-    """Markers in motion whose coordinates are known, and K, R and t of the fluoroscope."""
+    """Simulate moving markers with known coordinates, and K, R and t of the fluoroscope."""
     fluoroscope = rig.fluoroscopes[0]
     rng = np.random.default_rng([seed, 10])
     frames = []
     parts = []
     for number in range(1, count + 1):
-        # All over the field of view, and some depth.
+        # Fill the field of view, with some depth.
         cloud = rng.uniform(-1, 1, (targets, 3)) * (180, 180, 100) @ fluoroscope.rotation
         detection = Detection(beads=(targets, targets), false_matches=0.01 * (targets > 9))
         ids, uv = detect_beads(rng, fluoroscope, cloud, np.arange(targets), detection)
@@ -257,9 +257,9 @@ def points_rmse(
     interior: np.ndarray,
     predict: Callable[[np.ndarray], np.ndarray],
 ) -> float:
-    """RMSE [mm] in 3-D of the object points of exposures, with a calibration held.
+    """Return the 3-D RMSE [mm] of the object points of exposures, with a fixed calibration.
 
-    The survey has little weight, so that the points follow the images.
+    The survey has a low weight, so that the images determine the points.
     """
     weak = replace(rig.phantom, sd_mm=WEAK_SURVEY * rig.phantom.sd_mm)
     sensor = KnownSensor(interior, lambda frame: predict(frame.uv))
@@ -276,7 +276,7 @@ def points_rmse(
 def run_case(
     make: Callable[[VirtualRig, int], Case], seed: int
 ) -> tuple[float, float, np.ndarray, float]:
-    """Errors with the estimated and with the known distortion, and seconds."""
+    """Return the errors with estimated and with known distortion, and the time in seconds."""
     rig = virtual_rig(seed)
     fluoroscope = rig.fluoroscopes[0]
     case = make(rig, seed)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wall times, and Markdown tables of them."""
+"""Wall times and their Markdown tables."""
 
 import textwrap
 import time
@@ -14,7 +14,7 @@ T = TypeVar('T')
 
 
 def timed(function: Callable[[], T], repeats: int = 1) -> tuple[T, float]:
-    """Result of the last of repeated calls, and the median of their wall times [s]."""
+    """Return the result of the last of repeated calls, and the median of their wall times [s]."""
     times = []
     for _ in range(repeats):
         began = time.perf_counter()
@@ -24,12 +24,12 @@ def timed(function: Callable[[], T], repeats: int = 1) -> tuple[T, float]:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table with its first column left-aligned and the others right-aligned."""
+    """Return a Markdown table, with the first column aligned left and the others aligned right."""
     lines = [header, ['---'] + ['---:'] * (len(header) - 1), *rows]
     return '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
 
 
 def section(title: str, text: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A section of the report: title, a paragraph and a table."""
+    """Return a section of the report: title, a paragraph and a table."""
     paragraph = textwrap.fill(text, 118, break_on_hyphens=False)
     return f'## {title}\n\n{paragraph}\n\n{table(header, rows)}'

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Corrected images while a C-arm turns, beside the same images at a constant angle.
+"""Image correction while a C-arm rotates, compared with the same images at a constant angle.
 
     python -m benchmarks.turning_images [--seconds 10] [--only NAME]     printed as the tables of
     docs/how_good/speed.md
 
 Camera, image node and the reader (this process) share the machine. Cases at 30 Hz have one or two
-fluoroscopes; in cases `fast` the camera sends an image as soon as one of three in flight is
-corrected. The arm turns by 30 degrees a second, there and back: each image needs another map. A
-state of its joint comes with each image. Segments of shared memory of Fast DDS are large, as
+fluoroscopes; in cases `fast`, the camera sends an image as soon as one of three in flight is
+corrected. The arm rotates at 30 degrees per second back and forth, so each image needs another
+map. A joint state comes with each image. Segments of shared memory of Fast DDS are large, as
 described in docs/extraction.md. `correct` corrects a video and a stack, in this process.
 """
 
@@ -47,15 +47,15 @@ from .images import WIDE, _cpu, _stream_figures, wait
 from .timing import table
 
 NAMES = ('a', 'b')
-CHANGE_PX = 3.0  # at the rim
+CHANGE_PX = 3.0  # change at the rim
 EXPOSURES = 15
-RANGE = np.deg2rad(70)  # of the angles, either way
-TURN = np.deg2rad(30)  # per second
+RANGE = np.deg2rad(70)  # maximum angle, in either direction
+TURN = np.deg2rad(30)  # rad/s
 STILL = np.deg2rad(20)
-DIFFERENT = 8  # images that are repeated
-IN_FLIGHT = 3  # images of a fluoroscope, where the camera is as fast as the node
+DIFFERENT = 8  # distinct images, published in turn
+IN_FLIGHT = 3  # images in flight per fluoroscope, if the camera is as fast as the node
 VIDEO_FRAMES = 150
-MAPS = 'maps made for angles'  # in the diagnostics of the node
+MAPS = 'maps made for angles'  # key in the diagnostics of the node
 CASES = {  # name: (encoding, rate, names); rate 0: as fast as the node
     'mono8 30 Hz': ('mono8', 30.0, 'a'),
     'mono8 30 Hz, two': ('mono8', 30.0, 'ab'),
@@ -69,7 +69,7 @@ CASES = {  # name: (encoding, rate, names); rate 0: as fast as the node
 
 
 def turned(uv: np.ndarray, angle: float, size: tuple[int, int]) -> np.ndarray:
-    """Change (n, 2) [px] of the distortion at pixels uv (n, 2) with an angle [rad]."""
+    """Return the change (n, 2) [px] of the distortion at pixels uv (n, 2) for an angle [rad]."""
     x, y = ((uv - (np.asarray(size) - 1) / 2) / (max(size) / 2)).T
     spiral = (x * x + y * y)[:, None] * np.column_stack([-y, x])
     bend = np.column_stack([x * x, -y * y]) * y[:, None]
@@ -77,7 +77,7 @@ def turned(uv: np.ndarray, angle: float, size: tuple[int, int]) -> np.ndarray:
 
 
 def calibrations_of_a_turning_rig() -> dict[str, FluoroscopeCalibration]:
-    """Calibrations of both fluoroscopes from exposures at angles over the range."""
+    """Calibrate both fluoroscopes from exposures at angles over the range."""
     rig = virtual_rig(1)
     angles = np.random.default_rng(3).permutation(np.linspace(-RANGE, RANGE, EXPOSURES))
     out = {}
@@ -105,7 +105,7 @@ def calibrations_of_a_turning_rig() -> dict[str, FluoroscopeCalibration]:
 
 
 def accuracy(calibration: FluoroscopeCalibration, repeats: int = 40) -> dict[str, float]:
-    """CPU time of a new map [ms], and distances of corrected sources from their pixels [px]."""
+    """Measure CPU time of a new map [ms], and distances of corrected sources from pixels [px]."""
     cv2.setNumThreads(1)
     maps = AngleMaps(calibration)
     times = []
@@ -138,7 +138,7 @@ def accuracy(calibration: FluoroscopeCalibration, repeats: int = 40) -> dict[str
 
 
 def on_files(calibration: FluoroscopeCalibration) -> dict[str, dict[str, float]]:
-    """Time [ms] of an image of `correct` on a stack and a video, at one angle and turning."""
+    """Measure `correct` on a stack and a video [ms per image], at one angle and rotating."""
     angles = {n + 1: float(_angle(n / 30.0, True)) for n in range(VIDEO_FRAMES)}
     frames = _pictures(np.uint8, NAMES[:1])['a']
     out = {}
@@ -168,7 +168,7 @@ def on_files(calibration: FluoroscopeCalibration) -> dict[str, dict[str, float]]
 
 
 def _video(folder: Path, frames: Sequence[np.ndarray]) -> Path:
-    """Write a video of the images, FFV1, grey."""
+    """Write a grey FFV1 video of the images."""
     path = folder / 'trial.avi'
     size = frames[0].shape[::-1]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'FFV1'), 30.0, size, isColor=False)
@@ -182,7 +182,7 @@ def _video(folder: Path, frames: Sequence[np.ndarray]) -> Path:
 
 
 def _angle(seconds: float, turns: bool) -> float:
-    """Angle [rad] of the arm at a time; it turns there and back."""
+    """Return the angle [rad] of the arm at a time; it rotates back and forth."""
     if not turns:
         return STILL
     path = (TURN * seconds) % (4 * RANGE)
@@ -190,7 +190,7 @@ def _angle(seconds: float, turns: bool) -> float:
 
 
 def _pictures(dtype: type, names: Sequence[str]) -> dict[str, list[np.ndarray]]:
-    """Images of the phantom, some of each fluoroscope."""
+    """Return images of the phantom, several of each fluoroscope."""
     exposures = simulate_exposures(virtual_rig(1), DIFFERENT, 1).frames
     return {
         name: [
@@ -203,7 +203,7 @@ def _pictures(dtype: type, names: Sequence[str]) -> dict[str, list[np.ndarray]]:
 
 @dataclass(frozen=True)
 class _Show:
-    """What the camera shows: encoding, rate [Hz], names, whether the arm turns, duration [s]."""
+    """Images to show: encoding, rate [Hz], names, whether the arm rotates, duration [s]."""
 
     encoding: str
     rate: float
@@ -213,7 +213,7 @@ class _Show:
 
 
 def camera(show: _Show) -> None:
-    """Publish images of all fluoroscopes, each after a state of the joint with its stamp."""
+    """Publish images of all fluoroscopes, each after a joint state with the same stamp."""
     import rclpy
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import CameraInfo, Image, JointState
@@ -277,7 +277,7 @@ def camera(show: _Show) -> None:
             state.header.stamp = stamp_from_nanoseconds(now)
             states.publish(state)
         message = messages[name][number % DIFFERENT]
-        struct.pack_into('<iI', message, 4, *divmod(now, 10**9))  # behind the head of CDR
+        struct.pack_into('<iI', message, 4, *divmod(now, 10**9))  # after the CDR header
         outputs[name].publish(bytes(message))
         sent[name] += 1
 
@@ -311,7 +311,7 @@ def _release(free: threading.Semaphore, data: bytes, info: dict[str, int]) -> No
 
 
 class _Reader:
-    """Publishes the calibrations, and records the outputs of the node."""
+    """Publishes the calibrations and records the outputs of the node."""
 
     def __init__(self, calibrations: dict[str, FluoroscopeCalibration]) -> None:
         import rclpy
@@ -332,7 +332,7 @@ class _Reader:
             self._latched.append(publisher)
 
     def listen(self, names: str) -> tuple[dict[str, list[tuple[int, int]]], Any]:
-        """Collect (stamp, latency) [ns] of the outputs; the reader has to be stopped."""
+        """Collect (stamp, latency) [ns] of the outputs; the caller must stop the reader."""
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.qos import QoSProfile
         from sensor_msgs.msg import Image
@@ -372,7 +372,7 @@ class _Reader:
 
 
 def measured(reader: _Reader, show: _Show, log: IO[bytes]) -> dict[str, Any]:
-    """Figures of the node: rate of a fluoroscope [Hz], losses, latencies [ms] and CPU [ms]."""
+    """Measure the node: rate per fluoroscope [Hz], losses, latencies [ms] and CPU time [ms]."""
     node = subprocess.Popen(
         [
             sys.executable,
@@ -400,7 +400,7 @@ def measured(reader: _Reader, show: _Show, log: IO[bytes]) -> dict[str, Any]:
         sent = json.loads(stdout)
         used = _cpu(node) - began
         counted = sum(map(len, came.values())) - first
-        time.sleep(1.5)  # for the last diagnostics
+        time.sleep(1.5)  # wait for the last diagnostics
     finally:
         for process in (source, node):
             if process.poll() is None:
@@ -422,7 +422,7 @@ def measured(reader: _Reader, show: _Show, log: IO[bytes]) -> dict[str, Any]:
 def live(
     calibrations: dict[str, FluoroscopeCalibration], seconds: float, only: str = ''
 ) -> dict[str, dict[str, Any]]:
-    """Results of the cases whose name contains `only`, at a constant angle and turning."""
+    """Return results of cases whose name contains `only`, at a constant angle and rotating."""
     import rclpy
 
     from fluoro_calib_ros.demo.assessment import isolate_ros_graph
@@ -451,7 +451,7 @@ def live(
 def text_of(
     cases: dict[str, dict[str, Any]], files: dict[str, dict[str, float]], maps: dict[str, float]
 ) -> tuple[str, str, str]:
-    """Tables of the live cases and of files, and the accuracy of the maps."""
+    """Return the tables of live cases and files, and the accuracy of the maps."""
     rows = [
         [
             case,

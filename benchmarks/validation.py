@@ -3,8 +3,8 @@
 
 """The experiment of Chow et al. on the virtual rig, and further comparisons: `make validation`.
 
-Writes docs/how_good/accuracy.md and its pictures; experiment_plan lists the cases, experiment_text
-has the text.
+Writes docs/how_good/accuracy.md and its pictures; experiment_plan defines the cases,
+experiment_text the text.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .experiment_text import document_text
 
 
 def make(plan: Plan, document: Path) -> Outcomes:
-    """Run a plan, write the document (a Path) and its pictures; returns the outcomes by case."""
+    """Run a plan, write the document (a Path) and its pictures; return the outcomes by case."""
     began = time.monotonic()
     outcomes = run(plan.cases())
     paths = write_all(plan, outcomes, document.parent / 'images')
@@ -33,7 +33,7 @@ def make(plan: Plan, document: Path) -> Outcomes:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point: exit status 1 where a calibration failed."""
+    """Entry point; exit status 1 if a calibration failed."""
     parser = argparse.ArgumentParser(prog='python -m benchmarks.validation', description=__doc__)
     parser.add_argument(
         '--quick', action='store_true', help='all sections, but of a small experiment'

@@ -4,8 +4,8 @@
 """Error rates of the verdict on a calibration: false alarms, and detected faults of a given size.
 
 Every case simulates rigs with one fluoroscope, calibrates it and validates the calibration. The
-results are kept in a file, so that an interrupted run continues where it stopped. Prints the table
-of docs/how_good.md.
+results are stored in a file, so that an interrupted run continues where it stopped. Prints the
+table of docs/how_good.md.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from fluoro_calib_ros.report.tables import markdown_table
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 from tools.sections import write_section
 
-FIRST_SEED = 5018  # rigs that were not used to set a limit
+FIRST_SEED = 5018  # first seed of the rigs, which were not used to set a limit
 RIPPLE_PX = 80.0  # width of the local ripple that appears in the middle of the exposures
-PX_PER_MM = 2.67  # in the image, of a displacement of the phantom
+PX_PER_MM = 2.67  # image displacement per displacement of the phantom
 MAX_PX = 1023  # largest image coordinate
 
 
@@ -43,7 +43,7 @@ class Case:
     ----------
     fault : {'', 'drift', 'bead', 'survey', 'blur'}
     size : float
-        In the unit of the fault: px, mm, times the sd, mm.
+        Size in the unit of the fault: px, mm, multiples of the sd, mm.
     exposures : int
     model : str
         Correction model; '' for the one that the user selects.
@@ -101,7 +101,7 @@ def simulate(seed: int, case: Case) -> tuple[list[Frame], Phantom]:
         xyz = rig.true_mm + case.size * (phantom.xyz_mm - rig.true_mm)
         phantom = Phantom(phantom.target_id, xyz, phantom.sd_mm)
     elif case.fault == 'blur':
-        # The phantom moved during an exposure: half of its targets are displaced.
+        # The phantom moved during an exposure, so half of its targets are displaced.
         number = int(rng.integers(case.exposures))
         uv = frames[number].uv.copy()
         uv[rng.random(len(uv)) < 0.5] += case.size * PX_PER_MM * np.array([0.8, 0.6])
@@ -110,7 +110,7 @@ def simulate(seed: int, case: Case) -> tuple[list[Frame], Phantom]:
 
 
 def with_ripple(frames: Sequence[Frame], height: float, centre: np.ndarray) -> list[Frame]:
-    """Add a local ripple of a height [px] to the later half of the frames."""
+    """Add a local ripple of given height [px] to the second half of the frames."""
     out = []
     for i, frame in enumerate(frames):
         bump = np.exp(-np.sum((frame.uv - centre) ** 2, axis=1) / (2 * RIPPLE_PX**2))
@@ -139,7 +139,7 @@ def measure(name: str, seed: int, model: str) -> dict[str, Any]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a Markdown table: how many rigs of each case failed, and by which checks."""
+    """Return a Markdown table with the number of rigs of each case that failed, also by check."""
     lines = []
     for name in CASES:
         of_case = [row for row in rows if row['case'] == name]
@@ -151,7 +151,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def rigs_to_measure(prefix: str, done: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Return case and seed of the rigs of the cases with a prefix that are not done."""
+    """Return case and seed of rigs that are not done, for cases with this prefix."""
     finished = set(done)
     rigs = [
         (name, FIRST_SEED + i)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How honest standard deviations are between a change of the rig and its healing.
+"""Validity of standard deviations between a change of the rig and its healing.
 
-Streams of the generator of benchmarks.healing: a healthy rig, which then changes. Points and poses
-are found with and without what an alarm adds to the covariance. Writes a section of
+Streams of the generator of benchmarks.healing show a healthy rig, which then changes. Points and
+poses are estimated with and without the covariance that an alarm adds. Writes a section of
 docs/how_good.md: python -m benchmarks.widening --seeds 8
 """
 
@@ -55,7 +55,7 @@ def slight_bump(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
 
 
 def slow_creep(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
-    """Move b by 1 mm and 0.1 degrees in the course of the recording."""
+    """Move b gradually by 1 mm and 0.1 degrees during the recording."""
     return creep(rng, times) / 5
 
 
@@ -75,7 +75,7 @@ CASES = (
 
 
 class Stream:
-    """A rig that changes."""
+    """Frames of a rig that changes."""
 
     def __init__(self, number: int, scenario: Scenario, seed: int) -> None:
         given = Recording(BUMP if scenario.bodies == BUMP.bodies else KNEE, 1000 * number + seed)
@@ -103,16 +103,16 @@ class Stream:
         self.is_steady = scenario.is_steady
 
     def rows(self, begin_s: float, end_s: float) -> slice:
-        """Exposures of a time."""
+        """Return the rows of the exposures in a time interval."""
         return slice(round(begin_s * RATE_HZ), round(end_s * RATE_HZ))
 
     def pairs(self, rows: slice) -> list[dict[str, Frame]]:
-        """Exposures."""
+        """Return exposures as frames by fluoroscope."""
         return [dict(zip(NAMES, pair)) for pair in zip(*(self.frames[n][rows] for n in NAMES))]
 
 
 class Found:
-    """Squared errors over their covariance, by part: of points, and of poses."""
+    """Normalised squared errors of points and of poses, by part of the stream."""
 
     def __init__(self) -> None:
         self.points: dict[str, list[float]] = defaultdict(list)
@@ -129,7 +129,7 @@ class Found:
         has_watch: bool,
         alarms: np.ndarray | None = None,
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        """Return in which exposures there was an alarm, and errors of points and poses of each."""
+        """Return the alarm state of each exposure, and its errors of points and poses."""
         calibrations, orientation = rig
         watch = RigDriftWatch(orientation, dict.fromkeys(NAMES, SIZE)) if has_watch else None
         intersector = Intersector(orientation)
@@ -168,7 +168,7 @@ class Found:
         return np.array(squares)
 
     def take(self, part: str, errors: Sequence[dict[str, np.ndarray]]) -> None:
-        """Add the errors of exposures: one mean of a stream for each part."""
+        """Add the errors of exposures, as one mean per stream for each part."""
         if not errors:
             return
         for name in ('points', 'poses', 'sd_mm', 'share'):
@@ -188,7 +188,7 @@ def _squares(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _pose_square(stream: Stream, row: int, body: int, pose: BodyPoses) -> float:
-    xyz = stream.recording.bodies[body].xyz_mm  # in the frame that was learned
+    xyz = stream.recording.bodies[body].xyz_mm  # in the learned frame
     centre = xyz.mean(axis=0)
     truth = stream.points[row, body]
     turn = Rotation.align_vectors(truth - truth.mean(axis=0), xyz - centre)[0]
@@ -199,7 +199,7 @@ def _pose_square(stream: Stream, row: int, body: int, pose: BodyPoses) -> float:
 
 
 def measure(number: int, scenario: Scenario, seeds: Iterable[int], healed: int) -> Found:
-    """Follow the streams of a scenario; so many of them are healed."""
+    """Follow the streams of a scenario, and heal the first `healed` of them."""
     result = Found()
     for seed in seeds:
         stream = Stream(number, scenario, seed)
@@ -252,7 +252,7 @@ HEADER = (
 
 
 def cells(found: Found) -> list[str]:
-    """Cells of a row of the table."""
+    """Return the cells of a table row."""
 
     def mean(values: dict[str, list[float]], part: str) -> str:
         return f'{np.mean(values[part]):.2f}' if values[part] else ''
@@ -268,7 +268,7 @@ def cells(found: Found) -> list[str]:
 
 
 def main() -> None:
-    """Measure and write the section."""
+    """Run the measurements and write the section."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seeds', type=int, default=8, help='streams of a scenario')
     parser.add_argument('--healed', type=int, default=2, help='streams that are healed, too')

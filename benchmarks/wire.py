@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Decoding and encoding of stream messages: our CDR code, rosbags' typestore, rclpy.
+"""Decoding and encoding of stream messages by our CDR code, rosbags' typestore and rclpy.
 
     python -m benchmarks.wire
 
 Warm: in a loop. Cold: after a pause of 4 ms and writing 8 MB of other memory, as between two
-frames of a stream at 250 Hz with other work in between. Median of the repetitions.
+frames of a stream at 250 Hz with other work in between. Times are medians of the repetitions.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def median_us(function: Callable[[], object], cold: bool) -> float:
 
 
 def cases(count: int) -> dict[tuple[str, str], Callable[[], object]]:
-    """Return what is measured with a number of points, by task and library."""
+    """Return the measured functions for a number of points, by task and library."""
     rng = np.random.default_rng(1)
     frame = Frame(
         'a',

@@ -3,7 +3,7 @@
 
 """Run fuzz targets: `python -m fuzz TARGET [options of libFuzzer]`, or `all SECONDS`.
 
-all runs one target after the other, each for that time, and prints the number of its inputs.
+`all` runs one target after the other for SECONDS each, and prints the number of inputs of each.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def load(name: str) -> Target:
 
 
 def run_all(seconds: float) -> int:
-    """Run every target in a process of its own; returns the number of those with a finding."""
+    """Run every target in its own process; return the number of targets with a finding."""
     CORPUS.mkdir(parents=True, exist_ok=True)
     findings = 0
     for name in NAMES:
@@ -46,7 +46,7 @@ def run_all(seconds: float) -> int:
 
 
 def main(words: Sequence[str]) -> None:
-    """Run what the command line says."""
+    """Run the targets that the command line selects."""
     if len(words) == 2 and words[0] == 'all':
         sys.exit(min(run_all(float(words[1])), 1))
     if not words or words[0] not in NAMES:

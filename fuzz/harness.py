@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all fuzz targets have in common: the property that is checked, and the driver of atheris.
+"""Common parts of all fuzz targets: the property that is checked, and the driver of atheris.
 
-A target reads bytes as a file. The property: the reader gives a result, or raises DataError whose
-message is one line of limited length. No other exception, no RuntimeWarning.
+A target reads bytes as a file. The property: the reader returns a result, or raises DataError with
+a message of one line of limited length. It raises no other exception and no RuntimeWarning.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from typing import Any
 
 from fluoro_calib_ros.errors import DataError
 
-MAX_MESSAGE = 1000  # characters, of which the path may take some
-MAX_INPUT = 65536  # bytes of an input that atheris makes
-SECONDS_EACH = 20  # for one input, more is a finding
-MEMORY_MB = 3000  # of the process, more is a finding
+MAX_MESSAGE = 1000  # characters, including the path
+MAX_INPUT = 65536  # bytes; largest input that atheris generates
+SECONDS_EACH = 20  # per input; a longer time is a finding
+MEMORY_MB = 3000  # of the process; more is a finding
 CORPUS = Path('.fuzz') / 'corpus'
 INSTRUMENTED = ['fluoro_calib_ros', 'fuzz', 'mcap', 'rosbags']
 
@@ -36,14 +36,14 @@ class Target:
     ----------
     name : str
     file_name : str
-        The reader may decide by the ending.
+        The reader may select the format by the suffix.
     read : callable
         Reads the file at a path.
     seeds : callable
         Returns valid inputs.
     prepare : callable
-        Makes the content of the file from the input of the fuzzer, such as an archive with correct
-        checksums around it; by default it is the input itself.
+        Returns the content of the file for an input of the fuzzer, such as an archive with correct
+        checksums around it; by default, the input itself.
     """
 
     name: str
@@ -54,11 +54,11 @@ class Target:
 
 
 class Broken(AssertionError):
-    """The property does not hold."""
+    """The property is violated."""
 
 
 def both(*readers: Callable[[], Any]) -> None:
-    """Call several readers of one input, all of them. Raises DataError if one raised it."""
+    """Call all readers with one input. Raise DataError if any of them did."""
     refusal = None
     for read in readers:
         try:
@@ -71,7 +71,7 @@ def both(*readers: Callable[[], Any]) -> None:
 
 
 def check_message(text: str) -> None:
-    """Raise Broken unless the message of an error is one printable line of limited length."""
+    """Raise Broken unless an error message is one printable line of limited length."""
     if len(text) > MAX_MESSAGE:
         raise Broken(f'a message of {len(text)} characters: {text[:200]!r}')
     if not text or not text.isprintable():
@@ -79,7 +79,7 @@ def check_message(text: str) -> None:
 
 
 def check(target: Target, data: bytes, folder: Path) -> bool:
-    """Read an input; returns whether it was accepted. Raises where the property does not hold."""
+    """Read an input; return whether it was accepted. Raise if the property is violated."""
     path = folder / target.file_name
     path.write_bytes(target.prepare(data))
     with warnings.catch_warnings():
@@ -103,9 +103,9 @@ def write_corpus(target: Target) -> Path:
 
 
 def fuzz(load: Callable[[], Target], arguments: Sequence[str]) -> None:
-    """Run atheris with the arguments of libFuzzer. It does not return.
+    """Run atheris with the arguments of libFuzzer. This function does not return.
 
-    load imports the target: its modules, and those of the project, are instrumented.
+    load imports the target, so that its modules and those of the project are instrumented.
     """
     import atheris
 

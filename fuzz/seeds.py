@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Valid files from which the fuzzer starts: small, and made from a virtual rig."""
+"""Valid files from which the fuzzer starts: small, and derived from a virtual rig."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.simulation.rig import VirtualRig, simulate_exposures, virtual_rig
 
-SEPARATOR = b'\n--- '  # before the name of a member of a flattened archive
+SEPARATOR = b'\n--- '  # precedes the name of a member of a flattened archive
 TARGETS = 6
 
 
@@ -37,7 +37,7 @@ def rig() -> VirtualRig:
 
 @functools.cache
 def frames() -> dict[str, list[Frame]]:
-    """Return two exposures of few targets of each fluoroscope."""
+    """Return two exposures with few targets for each fluoroscope."""
     simulated = simulate_exposures(rig(), 2, 1).frames
     return {
         name: [
@@ -54,7 +54,7 @@ def frames() -> dict[str, list[Frame]]:
 
 
 def written(*writers: Callable[[Path], object]) -> list[bytes]:
-    """Return the content of the file that each writer makes at the path that it is given."""
+    """Return the content of the file that each writer creates at the path passed to it."""
     contents = []
     for write in writers:
         with tempfile.TemporaryDirectory() as folder:
@@ -65,9 +65,9 @@ def written(*writers: Callable[[Path], object]) -> list[bytes]:
 
 
 def flattened(content: bytes) -> bytes:
-    """Return a ZIP archive as its members one behind the other, each after its name.
+    """Return the members of a ZIP archive concatenated, each preceded by its name.
 
-    Without checksums and compression, a change of a byte is a change of the content.
+    Without checksums and compression, changing a byte changes the content.
     """
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         return b''.join(
@@ -76,7 +76,7 @@ def flattened(content: bytes) -> bytes:
 
 
 def archive_of(flat: bytes) -> bytes:
-    """Return the ZIP archive of a flattened one."""
+    """Return the ZIP archive whose flattened form is given."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, 'w') as archive:
         for member in flat.split(SEPARATOR)[1:]:
@@ -86,7 +86,7 @@ def archive_of(flat: bytes) -> bytes:
 
 
 def bag_content(storage: str = 'mcap') -> bytes:
-    """Return a bag file of the frames, without compression and checksums."""
+    """Return a bag file of the frames without compression and checksums."""
     from mcap.writer import CompressionType, Writer
 
     from fluoro_calib_ros.io.bags.metadata import PROFILES, TARGET_OBSERVATIONS, to_cdr, to_yaml
@@ -127,18 +127,18 @@ def bag_folder(path: Path) -> None:
 
 
 def images() -> list[np.ndarray]:
-    """Return small grey images of 8 and of 16 bits."""
+    """Return small grey images of 8 and 16 bits."""
     ramp = np.add.outer(np.arange(12), np.arange(16))
     return [(8 * ramp).astype(np.uint8), (2000 * ramp).astype(np.uint16)]
 
 
 def encoded_images(suffix: str) -> Sequence[bytes]:
-    """Return the images as files with this ending."""
+    """Return the images encoded as files with this suffix."""
     return [cv2.imencode(suffix, image)[1].tobytes() for image in images()]
 
 
 def in_folder(write: Callable[[Path], object], name: str = '*') -> bytes:
-    """Return the content of the one file of this name that a function writes into a folder."""
+    """Return the content of the only file with this name that a function writes into a folder."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / 'out'
         write(out)

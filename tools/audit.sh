@@ -1,6 +1,6 @@
 #!/bin/sh
-# make audit: compare requirements.lock with known vulnerabilities, by pip-audit in a venv of its own.
-# Exit status 1: there are some. 2: the service of advisories cannot be reached from here.
+# make audit: compare requirements.lock with known vulnerabilities, by pip-audit in its own venv.
+# Exit status 1: vulnerabilities found. 2: the advisory service cannot be reached from here.
 set -u
 cd "$(dirname "$0")/.." || exit 1
 

@@ -1,7 +1,7 @@
 #!/bin/sh
-# make lock: resolve requirements.in into requirements.lock by uv, for all supported Pythons, with
+# make lock: resolve requirements.in into requirements.lock with uv, for all supported Pythons, with
 # the hash of every file of every package. Versions in the lock are kept where they still fit:
-# make lock ARGS=--upgrade takes the newest, ARGS='--upgrade-package numpy' those of one package.
+# make lock ARGS=--upgrade takes the newest versions, ARGS='--upgrade-package numpy' those of one package.
 set -u
 cd "$(dirname "$0")/.." || exit 1
 

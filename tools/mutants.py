@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Mutation testing: the share of single plausible bugs that the quick tests catch, by room.
+"""Mutation testing: the share of plausible single bugs that the quick tests catch, by room.
 
-In a copy of the repository, a bug is put into a random line of a function that quick tests
-execute, and the tests that execute the line are run, quick ones first. What survives is printed:
-a figure or a kind that nobody asserts, or a change that makes no difference. Operators after
+In a copy of the repository, a bug is inserted into a random line of a function that quick tests
+execute, and the tests that execute the line are run, fastest first. Surviving bugs are printed:
+a number or kind that no test asserts, or a change that makes no difference. Operators after
 Offutt et al., "An experimental determination of sufficient mutant operators", 1996.
 """
 
@@ -35,13 +35,13 @@ RECORD = ROOT / '.mutants.json'
 OWN_ROOMS = ('io/formats', 'io/bags', 'nodes/runtime', 'nodes/messages')
 QUICK = ['-q', '-p', 'no:cacheprovider', '-p', 'no:xdist', '-m', 'not ros and not long']
 LEFT_OUT = ('.git', '.venv', '.build', '.*_cache', '.hypothesis', '.mutants.json', '_build')
-MAX_TESTS_S = 40.0  # of the tests that a bug is shown to
-OTHER_ROOM = 5.0  # times as long a test of another room counts in the order of tests
-FIRST = 12  # tests that a bug is shown to before all of them
+MAX_TESTS_S = 40.0  # maximum duration of the tests that are run against one bug
+OTHER_ROOM = 5.0  # factor on the time of a test of another room, for the order of tests
+FIRST = 12  # number of tests that are tried before all of them
 RECORD_S = 3600.0
-MIN_LIMIT_S = 60.0  # of CPU time, after which a test has caught a bug
+MIN_LIMIT_S = 60.0  # minimum limit of CPU time; a bug that exceeds the limit counts as caught
 WAITING = 10.0
-NO_TESTS = 5  # exit status of pytest
+NO_TESTS = 5  # exit status of pytest if no tests were collected
 THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS')
 SWAPPED: dict[type, type] = {
     ast.Add: ast.Sub,
@@ -84,7 +84,7 @@ class Bug:
 
 
 def bugs_of(node: ast.AST) -> Iterator[tuple[str, ast.AST, ast.AST]]:
-    """Kind of a bug, what is replaced, and by what, for one node of a syntax tree."""
+    """Yield kind of bug, node to replace and replacement, for one node of a syntax tree."""
 
     def changed(**fields: Any) -> Any:
         out = copy.copy(node)
@@ -128,7 +128,7 @@ def bugs_of(node: ast.AST) -> Iterator[tuple[str, ast.AST, ast.AST]]:
 
 
 def _is_text(node: ast.BinOp | ast.AugAssign) -> bool:
-    """Whether strings are joined or formatted: what they say is another matter."""
+    """Return whether strings are joined or formatted: their wording is not tested here."""
     parts = ast.walk(node)
     return any(
         isinstance(p, ast.JoinedStr) or (isinstance(p, ast.Constant) and isinstance(p.value, str))
@@ -137,7 +137,7 @@ def _is_text(node: ast.BinOp | ast.AugAssign) -> bool:
 
 
 def bugs_in(path: Path, executed: set[int]) -> list[Bug]:
-    """Every bug in the executed lines of the functions of a file."""
+    """Return every bug in the executed lines of the functions of a file."""
     text = path.read_text()
     starts = [0]
     for line in text.splitlines(keepends=True):
@@ -162,7 +162,7 @@ def bugs_in(path: Path, executed: set[int]) -> list[Bug]:
 
 
 def room_of(path: str) -> str:
-    """Return the room of a source or of a test, by its path relative to the root."""
+    """Return the room of a source or test file, given its path relative to the root."""
     inner = '/'.join(path.split('/')[1:-1])
     return next((room for room in OWN_ROOMS if inner == room), inner.split('/')[0] or 'top')
 
@@ -171,13 +171,13 @@ def room_of(path: str) -> str:
 
 
 class Chosen:
-    """Plugin of pytest that runs some tests only, in their order, and notes how each ends."""
+    """Pytest plugin that runs selected tests only, in their order, and records their outcomes."""
 
     def __init__(self, tests: Sequence[str]) -> None:
         self.rank = {test: rank for rank, test in enumerate(tests)}
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        """Leave out all other tests."""
+        """Deselect all other tests."""
         items[:] = sorted(
             (item for item in items if item.nodeid in self.rank),
             key=lambda item: self.rank[item.nodeid],
@@ -185,26 +185,26 @@ class Chosen:
 
 
 class Recorder:
-    """Plugin of pytest that notes which test executes which line, and how long each takes."""
+    """Pytest plugin that records the lines that each test executes, and its duration."""
 
     def __init__(self, coverage: Any) -> None:
         self.coverage = coverage
         self.seconds: dict[str, float] = defaultdict(float)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """Tell coverage which test begins."""
+        """Notify coverage of the test that begins."""
         self.coverage.switch_context(nodeid)
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """Sum the times of a test."""
+        """Sum the durations of the phases of a test."""
         self.seconds[report.nodeid] += report.duration
 
 
 def in_child(work: Any, limit_s: float) -> int:
-    """Return the exit status of work() in a child process, negative where it took too long.
+    """Return the exit status of work() in a child process, negative if it took too long.
 
-    The limit is one of CPU time: on a busy machine time passes without any. A child that waits for
-    ever takes none, and is ended after WAITING times as long.
+    The limit is on CPU time, since a busy machine may grant none for a while. A child that waits
+    forever uses no CPU time, and is terminated after WAITING times as long in wall time.
     """
     pid = os.fork()
     if pid == 0:
@@ -226,7 +226,7 @@ def in_child(work: Any, limit_s: float) -> int:
 
 
 def record(folders: Sequence[str]) -> int:
-    """Write the seconds of quick tests below folders, and which of them execute which lines."""
+    """Write the durations of quick tests below folders, and which lines each executes."""
     import coverage
     import pytest
 
@@ -253,7 +253,7 @@ def record(folders: Sequence[str]) -> int:
 
 
 def tests_for(bug: Bug, recorded: Mapping[str, Any]) -> list[str]:
-    """Return the tests that execute the line of a bug: quick ones first, and those of its room."""
+    """Return the tests that execute the line of a bug: fast ones of the same room first."""
     tests, seconds = recorded['tests'], recorded['seconds']
     room = room_of(bug.path).split('/')[0]
     there = sorted(
@@ -271,7 +271,7 @@ def tests_for(bug: Bug, recorded: Mapping[str, Any]) -> list[str]:
 
 
 def is_caught(bug: Bug, tests: Sequence[str], folder: Path, limit_s: float) -> bool:
-    """Return whether a test fails with a bug in a copy of the repository."""
+    """Return whether any test fails with a bug in a copy of the repository."""
     path = folder / bug.path
     before = path.read_bytes()
     times = path.stat()
@@ -295,7 +295,7 @@ def is_caught(bug: Bug, tests: Sequence[str], folder: Path, limit_s: float) -> b
 
 
 def shown(bug: Bug) -> str:
-    """Return a bug in a line of text."""
+    """Return the description of a bug in one line."""
     source = (ROOT / bug.path).read_bytes()
     old = source[bug.begin : bug.end].decode()
     texts = [' '.join(text.split())[:90] for text in (old, bug.new)]
@@ -303,7 +303,7 @@ def shown(bug: Bug) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status is 0 whatever survives."""
+    """Entry point; the exit status is 0 whichever bugs survive."""
     parser = argparse.ArgumentParser(prog='python -m tools.mutants', description=__doc__)
     parser.add_argument('rooms', nargs='*', help='rooms, for example checks io/formats; all')
     parser.add_argument('--count', type=int, default=10, help='bugs in a room (10)')
@@ -318,7 +318,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ[name] = '1'
     if options.record or not RECORD.exists():
         folders = options.record or ['tests']
-        # in a child, as this process must not import the package
+        # Run in a child, since this process must not import the package.
         in_child(lambda: record(folders), RECORD_S)
     recorded = json.loads(RECORD.read_text())
     candidates: dict[str, list[Bug]] = defaultdict(list)
@@ -329,7 +329,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ['PYTHONDONTWRITEBYTECODE'] = '1'
     sys.dont_write_bytecode = True
     for name in ('numpy', 'scipy.optimize', 'scipy.spatial', 'cv2', 'sklearn.neighbors', 'pytest'):
-        __import__(name)  # once for all children
+        __import__(name)  # import once for all children
     seconds = dict(zip(recorded['tests'], recorded['seconds']))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / ROOT.name
@@ -341,7 +341,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for bug in chosen:
                 tests = tests_for(bug, recorded)
                 limit = MIN_LIMIT_S + 5 * sum(seconds[test] for test in tests)
-                # Few tests catch most bugs, and to load all takes longer than to run them.
+                # Few tests catch most bugs, and loading all tests takes longer than running them.
                 if any(is_caught(bug, tests[:n], folder, limit) for n in (FIRST, None)):
                     caught += 1
                 else:
@@ -351,7 +351,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _chosen(bugs: Sequence[Bug], count: int, seed: str) -> list[Bug]:
-    """Return some bugs in different lines."""
+    """Return a random selection of bugs in different lines."""
     rng = random.Random(seed)
     of_line: dict[tuple[str, int], list[Bug]] = defaultdict(list)
     for bug in bugs:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Generated sections of the documentation, between the marks `begin: name` and `end: name`."""
+"""Generated sections of the documentation, between the markers `begin: name` and `end: name`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 
 def with_section(page: str, name: str, content: str) -> str:
-    """Return the text of a page whose section of this name has this content.
+    """Return the text of a page with the content of a named section replaced.
 
-    Raises ValueError unless the page has the marks of the section once.
+    Raise ValueError unless the page contains the markers of the section exactly once.
     """
     begin, end = f'<!-- begin: {name} -->\n', f'<!-- end: {name} -->'
     pattern = re.compile(f'{re.escape(begin)}.*?{re.escape(end)}', re.DOTALL)
@@ -23,7 +23,7 @@ def with_section(page: str, name: str, content: str) -> str:
 
 
 def write_section(page: Path, name: str, content: str) -> None:
-    """Replace a section of a page; a page that does not exist becomes the section alone."""
+    """Replace a section of a page; a missing page is created with this section only."""
     if page.exists():
         page.write_text(with_section(page.read_text(), name, content))
     else:
@@ -31,7 +31,7 @@ def write_section(page: Path, name: str, content: str) -> None:
 
 
 def show_section(content: str, page: Path | None, name: str) -> None:
-    """Print a section, and write it into a page where one is given."""
+    """Print a section, and write it into a page if one is given."""
     print(content)
     if page:
         write_section(page, name, content)

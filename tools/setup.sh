@@ -1,6 +1,6 @@
 #!/bin/sh
 # make setup: choose a Python, then let tools/setup_env.py do the work.
-# PYTHON=python3.12 make setup chooses; without it an existing .venv keeps its Python.
+# PYTHON=python3.12 make setup selects one; without it, an existing .venv keeps its Python.
 set -u
 cd "$(dirname "$0")/.." || exit 1
 

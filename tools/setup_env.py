@@ -7,7 +7,7 @@
 tools/setup.sh.
 
 Standard library only. Each step leaves a stamp in .venv/.setup with a digest of what it was made
-from; a step whose stamp is right is not repeated, and a step that fails or is interrupted leaves
+from; a step whose stamp is valid is not repeated, and a step that fails or is interrupted leaves
 none. Deleting .venv, moving the folder, another PYTHON, a changed lock file or a changed message
 are therefore all noticed.
 """
@@ -39,8 +39,7 @@ LOG = BUILD / 'setup.log'
 LOCK = ROOT / 'requirements.lock'
 HOOK = ROOT / 'tools' / 'venv_hook.py'
 PACKAGE = 'fluoro_calib_ros'
-# tf2_msgs has no wheel: its one message that the nodes publish is built where ROS does not bring
-# it
+# tf2_msgs has no wheel: the single message that the nodes publish is built unless ROS provides it.
 MESSAGES = {'fluoro_calib_msgs': ROOT / 'msg_defs', 'tf2_msgs': ROOT / 'tools' / 'tf2_msgs'}
 
 BASE_PYTHON = getattr(sys, '_base_executable', None) or sys.executable
@@ -49,8 +48,8 @@ SITE_PACKAGES = (
     VENV / 'lib' / f'python{sys.version_info.major}.{sys.version_info.minor}' / 'site-packages'
 )
 
-# What must not leak in from the shell: a sourced ROS, another venv, settings of pip, of an outer
-# make.
+# Variables that must not leak in from the shell: a sourced ROS, another venv, settings of pip, of
+# an outer make.
 FOREIGN = (
     'AMENT_',
     'COLCON_',
@@ -83,7 +82,7 @@ FOREIGN = (
 
 
 class SetupError(Exception):
-    """Something is wrong that the user can put right; the text says what."""
+    """A problem that the user can fix; the text describes it."""
 
 
 def environment() -> dict[str, str]:
@@ -112,7 +111,7 @@ def run(*command: str) -> None:
         )
         try:
             code = process.wait()
-        except KeyboardInterrupt:  # Ctrl-C told the program too: let it stop by itself
+        except KeyboardInterrupt:  # the program has received Ctrl-C too: let it stop by itself
             for stop in (lambda: None, process.terminate, process.kill):
                 stop()
                 with contextlib.suppress(subprocess.TimeoutExpired):
@@ -142,7 +141,7 @@ def digest(*parts: str | pathlib.Path) -> str:
 
 
 class Step:
-    """One step: what it is made from, and whether that has been done."""
+    """A setup step: its inputs, and whether it has been done."""
 
     def __init__(
         self, name: str, title: str, action: Callable[[], None], *inputs: str | pathlib.Path
@@ -154,14 +153,14 @@ class Step:
         self.wanted = digest(name, *inputs)
 
     def is_done(self) -> bool:
-        """Tell whether the stamp says that this was done from just these inputs."""
+        """Return whether the stamp shows that the step was done from exactly these inputs."""
         try:
             return self.stamp.read_text() == self.wanted
         except OSError:
             return False
 
     def do(self) -> None:
-        """Carry the step out, with one line for the user."""
+        """Perform the step, with one line of output for the user."""
         start = time.monotonic()
         print(f'setup: {self.title} ... ', end='', flush=True)
         self.stamp.unlink(missing_ok=True)
@@ -180,7 +179,7 @@ class Step:
 
 
 def check_machine() -> None:
-    """Raise SetupError with one sentence for each thing that is missing."""
+    """Raise SetupError with one sentence for each missing prerequisite."""
     missing = []
     version = f'{sys.version_info.major}.{sys.version_info.minor}'
     if sys.implementation.name != 'cpython':
@@ -230,7 +229,7 @@ def check_machine() -> None:
 
 
 def compiles() -> bool:
-    """Tell whether a C and a C++ compiler turn a trivial source into a shared library."""
+    """Return whether a C and a C++ compiler turn a trivial source into a shared library."""
     sources = (
         ('CC', ('cc', 'gcc', 'clang'), 'c', '#include <stdio.h>\n'),
         ('CXX', ('c++', 'g++', 'clang++'), 'c++', '#include <string>\n'),
@@ -259,13 +258,13 @@ def compiles() -> bool:
 
 
 def make_venv() -> None:
-    """Make .venv anew with every package of the lock file."""
+    """Recreate .venv with every package of the lock file."""
     if VENV.is_symlink():
         VENV.unlink()
     elif VENV.exists():
         shutil.rmtree(VENV)
     run(BASE_PYTHON, '-m', 'venv', str(VENV))
-    # colcon crawls the folder it is started in for packages: not this one
+    # colcon searches the folder in which it is started for packages; exclude .venv.
     (VENV / 'COLCON_IGNORE').touch()
     pip = (VENV_PYTHON, '-m', 'pip', 'install', '--no-deps', '--require-hashes')
     installers = BUILD / 'installers.lock'
@@ -279,7 +278,7 @@ def make_venv() -> None:
 
 
 def locked_installers(lock: str) -> str:
-    """Return the part of a lock file that pins what builds and installs, with its hashes."""
+    """Return the part of a lock file that pins build and install tools, with hashes."""
     requirements = re.findall(r'^\S+==.*(?:\n    .*)*', lock, re.MULTILINE)
     return '\n'.join(
         requirement
@@ -316,7 +315,7 @@ def rewrite_cmake_files() -> None:
 def install_hook() -> None:
     """Let every Python of .venv start with the environment that ROS needs."""
     shutil.copyfile(HOOK, SITE_PACKAGES / 'fluoro_calib_venv.py')
-    # .pth files are read in the order of their names: before ros_wheels_bootstrapper.pth
+    # .pth files are read in alphabetical order: this name precedes ros_wheels_bootstrapper.pth.
     (SITE_PACKAGES / '00_fluoro_calib_venv.pth').write_text('import fluoro_calib_venv\n')
     run(VENV_PYTHON, '-c', 'import rclpy')
 
@@ -335,7 +334,7 @@ def build_messages() -> None:
         ):
             for name in glob.glob(
                 str(VENV / pattern)
-            ):  # a message that is gone must not stay installed
+            ):  # a message that was removed must not stay installed
                 if os.path.isdir(name):
                     shutil.rmtree(name)
                 else:
@@ -371,7 +370,7 @@ def build_messages() -> None:
 
 
 def install_package() -> None:
-    """Install this package into .venv so that its sources are used where they are."""
+    """Install this package into .venv such that its sources are used in place."""
     run(
         VENV_PYTHON,
         '-m',
@@ -382,8 +381,8 @@ def install_package() -> None:
         '--editable',
         str(ROOT),
     )
-    # an editable install leaves out data_files: what ROS looks up in share/ and lib/ is linked,
-    # each file on its own, for `ros2 launch` follows no links to folders
+    # An editable install omits data_files, so link the files that ROS looks up in share/ and lib/,
+    # each file separately, because `ros2 launch` does not follow links to folders.
     share = VENV / 'share' / PACKAGE
     index = VENV / 'share' / 'ament_index' / 'resource_index' / 'packages'
     files = [ROOT / 'package.xml', *(ROOT / 'launch').iterdir(), *(ROOT / 'config').iterdir()]
@@ -401,7 +400,7 @@ def install_package() -> None:
 
 
 def steps() -> list[Step]:
-    """Return the steps in their order, each naming what it depends on."""
+    """Return the steps in order, each with the inputs on which it depends."""
     venv = Step(
         'packages',
         f'packages from {LOCK.name} into .venv',
@@ -441,7 +440,7 @@ def steps() -> list[Step]:
 
 @contextlib.contextmanager
 def only_one() -> Iterator[None]:
-    """Hold a lock file, so that two set-ups in one folder follow each other."""
+    """Hold a lock file, so that two set-ups in one folder run one after the other."""
     with open(BUILD / 'setup.lock', 'w') as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -452,7 +451,7 @@ def only_one() -> Iterator[None]:
 
 
 def set_up() -> None:
-    """Do what is not done yet."""
+    """Run the steps that have not been done yet."""
     plan = steps()
     if all(step.is_done() for step in plan):
         return
@@ -464,7 +463,7 @@ def set_up() -> None:
 
 
 def main() -> int:
-    """Run, and turn every failure into something to act upon."""
+    """Run the set-up, and turn every failure into an actionable message."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     BUILD.mkdir(exist_ok=True)
     (BUILD / 'COLCON_IGNORE').touch()

@@ -1,27 +1,27 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Give every Python of the project's .venv the environment that ROS needs, with nothing sourced.
+"""Give every Python of the project's .venv the environment that ROS needs, without sourcing.
 
 tools/setup_env.py copies this file into the venv as fluoro_calib_venv.py, with a .pth file that
-imports it before anything else. The shared libraries of ROS are found by LD_LIBRARY_PATH only,
-which the loader reads when a process starts: so this starts Python once more, in place, with the
-right one. The ROS wheels bring the same (ros_wheels_bootstrapper), but theirs takes a mark left by
-another venv's process for its own, and leaves to chance which ROS comes first where one has been
+imports it before anything else. The shared libraries of ROS are found only by LD_LIBRARY_PATH,
+which the loader reads when a process starts, so this hook re-executes Python in place with the
+right value. The ROS wheels do the same (ros_wheels_bootstrapper), but mistake a mark left by
+another venv's process for their own, and leave it to chance which ROS comes first if one has been
 sourced.
 """
 
 from __future__ import annotations
 
-import _signal  # built in, unlike the module signal, which takes as long as all of this
+import _signal  # built in, unlike the module signal, whose import takes as long as this whole hook
 import os
 import sys
 
-MARK = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'  # the wheels' own: set, their bootstrap does nothing
+MARK = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'  # the wheels' mark; if set, their bootstrap does nothing
 IS_FIRST = os.environ.get(MARK) != sys.prefix
 
-# An interrupt before a program can handle it is to end it without a traceback, and a node with
-# status 0, as later: launch calls anything else a node that died.
+# An interrupt before a program can handle it must end the program without a traceback, and a node
+# with status 0, as it does later: launch reports a node with any other status as died.
 _IS_NODE = any(word.endswith('_node') for word in sys.orig_argv[1:2])
 if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
     if _IS_NODE:
@@ -43,8 +43,8 @@ def environment(old: dict[str, str], prefix: str) -> dict[str, str]:
     def below(entry: str, folders: list[str]) -> bool:
         return any((entry + '/').startswith(folder.rstrip('/') + '/') for folder in folders)
 
-    # What else has been sourced is another ROS with its workspaces, or workspaces that were built
-    # upon this one.
+    # Anything else that was sourced is another ROS with its workspaces, or workspaces that were
+    # built on top of this one.
     others = [
         entry
         for entry in entries('AMENT_PREFIX_PATH')
@@ -75,14 +75,13 @@ def environment(old: dict[str, str], prefix: str) -> dict[str, str]:
         else:
             new.pop(name, None)
     if foreign:
-        new.pop('RMW_IMPLEMENTATION', None)  # the other ROS may have one that the wheels lack
+        new.pop('RMW_IMPLEMENTATION', None)  # may not be among the wheels
+    # rcl does not start if it cannot write its log.
     if not {'ROS_LOG_DIR', 'ROS_HOME'} & new.keys():
-        home = new.setdefault(
-            'HOME', os.path.expanduser('~')
-        )  # rcl refuses to start where it cannot write its log
+        home = new.setdefault('HOME', os.path.expanduser('~'))
         logs = [path for path in (home + '/.ros/log', home + '/.ros', home) if os.path.isdir(path)]
         if not logs or not os.access(logs[0], os.W_OK):
-            import tempfile  # rarely needed, and half of the time that all of this takes
+            import tempfile  # rarely needed, and takes half the time of this hook
 
             new['ROS_LOG_DIR'] = os.path.join(tempfile.gettempdir(), f'ros_log_{os.getuid()}')
     new[MARK] = prefix

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write what is generated from declarations: parameters of the nodes, the record of a calibration.
+"""Write all that is generated from declarations: node parameters and the record of a calibration.
 
     python -m tools.write_tables
 
-These are config/fluoro_calib.yaml and tables of docs/nodes.md and docs/files.md;
+The output is config/fluoro_calib.yaml and tables in docs/nodes.md and docs/files.md;
 tests/nodes/test_parameters.py compares them with the declarations.
 """
 
@@ -45,7 +45,7 @@ HEAD = """\
 
 
 def parameters(node: str) -> dict[str, Option]:
-    """Return the declared parameters of a node by name."""
+    """Return the declared parameters of a node, by name."""
     return parameters_of(import_module(f'fluoro_calib_ros.nodes.{node}').PARAMETERS)
 
 
@@ -55,7 +55,7 @@ def settable(node: str) -> frozenset[str]:
 
 
 def yaml_text() -> str:
-    """Return config/fluoro_calib.yaml."""
+    """Return the content of config/fluoro_calib.yaml."""
     lines = [HEAD.rstrip()]
     for node in CONFIGURED:
         lines += ['', f'/**/{node}:', '  ros__parameters:']
@@ -70,7 +70,7 @@ def yaml_text() -> str:
 def table(node: str) -> str:
     """Return the parameter table of a node for docs/nodes.md, without the limits of reading.
 
-    Settable are the parameters that may change while the node runs.
+    Parameters that may change while the node runs are marked as settable.
     """
     own = {
         name: declaration
@@ -81,7 +81,7 @@ def table(node: str) -> str:
 
 
 def limits_table() -> str:
-    """Return the table of the parameters of all nodes that read files or images."""
+    """Return the table of the parameters shared by all nodes that read files or images."""
     return _table(READ_LIMITS.declarations, frozenset())
 
 
@@ -136,19 +136,19 @@ def record_table() -> str:
 
 
 def _description(declaration: Option) -> str:
-    """Return description and unit."""
+    """Return the description and unit."""
     unit = f' [{declaration.unit}]' if declaration.unit else ''
     return f'{declaration.description}{unit}'
 
 
 def _comment(declaration: Option) -> str:
-    """Return description, unit and choices."""
+    """Return the description, unit and choices."""
     choices = f' ({" | ".join(declaration.choices)})' if declaration.choices else ''
     return f'{_description(declaration)}{choices}'
 
 
 def _values(declaration: Option) -> str:
-    """Return choices or range."""
+    """Return the choices or the range."""
     if declaration.choices:
         return ', '.join(f'`{choice}`' for choice in declaration.choices)
     if declaration.minimum is not None and declaration.maximum is not None:

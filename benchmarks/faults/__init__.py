@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults that are made for real: docs/reliability.md.
+"""Real faults injected into running nodes: docs/reliability.md.
 
 python -m benchmarks.faults [--only KIND,...] [--count N] [--seed N]
 """

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Make the faults of docs/reliability.md, and print what happened as tables.
+"""Inject the faults of docs/reliability.md, and print the results as tables.
 
 python -m benchmarks.faults [--only KIND,...] [--count N] [--seed N]
 """

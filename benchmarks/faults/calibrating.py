@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A client of a calibration node: publishes exposures and begins jobs."""
+"""A client of a calibration node that publishes exposures and starts jobs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TIMEOUT_S = 60.0
 
 
 class JobClient:
-    """Publishes the exposures of a bag; a context manager that holds the ROS context."""
+    """Publishes the exposures of a bag; a context manager that owns the ROS context."""
 
     def __init__(self, bag: Path, model: str = 'none') -> None:
         self._model = model
@@ -66,8 +66,8 @@ class JobClient:
         self._exposures[status.fluoroscope] = status.exposures
 
     def collect(self, count: int, process: Process) -> None:
-        """Publish the first exposures to a node that has just been started."""
-        # The endpoints of a killed node are there until DDS notices.
+        """Publish the first exposures to a newly started node."""
+        # The endpoints of a killed node remain until DDS notices.
         self.wait(lambda: 'ready' in process.output, 'the node')
         self._exposures.clear()
         self.wait(lambda: self._exposures, 'the status of the node')
@@ -75,7 +75,7 @@ class JobClient:
 
         def collected() -> bool:
             nonlocal sent
-            if time.monotonic() > sent + 1.0:  # the first ones may come before discovery
+            if time.monotonic() > sent + 1.0:  # the first ones may precede discovery
                 sent = time.monotonic()
                 for pair in self._pairs[:count]:
                     for frame in pair:
@@ -86,12 +86,12 @@ class JobClient:
         self.wait(collected, f'{count} exposures')
 
     def begin(self) -> Any:
-        """Ask for a calibration; returns the future of the answer."""
+        """Request a calibration; return the future of the response."""
         self.wait(self._calibrate.service_is_ready, 'the service')
         return self._calibrate.call_async(Calibrate.Request(model=self._model))
 
     def wait(self, condition: Callable[[], object], what: str) -> None:
-        """Spin until a condition is true. Raises TimeoutError."""
+        """Spin until a condition is true. Raise TimeoutError after the deadline."""
         end = time.monotonic() + TIMEOUT_S
         while not condition():
             if time.monotonic() > end:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recorded bags that are cut off anywhere, or have a flipped bit: what is recovered."""
+"""Recover recorded bags that are truncated anywhere or have a flipped bit."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from fluoro_calib_ros.simulation.rig import StreamStart, simulate_tracking, virt
 from ..timing import section
 
 Message = tuple[str, int, bytes]
-Chunk = tuple[int, int, list[Message]]  # first byte, byte behind, messages
+Chunk = tuple[int, int, list[Message]]  # first byte, end (exclusive), messages
 
 
 def run(folder: Path, count: int, seed: int) -> str:
-    """Damage a recorded bag 2 x `count` times each way; returns the section of the report."""
+    """Damage a recorded bag 2 x `count` times each way; return the section of the report."""
     bag = recorded(folder / 'bag')
     content = bag.read_bytes()
     chunks = chunks_of(bag)
@@ -67,7 +67,7 @@ KEYS = ('bags', 'whole', 'nothing to recover', 'incomplete', 'false', 'silent')
 
 
 def judged(path: Path, out: Path, intact: Counter[Message], chunks: list[Chunk]) -> Counter[str]:
-    """Recover a damaged bag, and return what became of it, by KEYS."""
+    """Recover a damaged bag, and return the outcome by KEYS."""
     everything = Counter(m for *_, inside in chunks for m in inside)
     found: Counter[str] = Counter(bags=1)
     try:
@@ -83,7 +83,7 @@ def judged(path: Path, out: Path, intact: Counter[Message], chunks: list[Chunk])
 
 
 def recorded(path: Path) -> Path:
-    """Record moving markers; returns the file of the bag."""
+    """Record moving markers; return the file of the bag."""
     recording = Recording(path, RecordingOptions(flush_period=0.05))
     recording.start()
     frames = simulate_tracking(virtual_rig(1), 4.0, 120.0, 1, 0.25, StreamStart(10**18)).frames
@@ -94,15 +94,15 @@ def recorded(path: Path) -> Path:
     for pair in zip(*frames.values()):
         for number, frame in enumerate(pair):
             data = to_cdr(message_from_frame(frame), TARGET_OBSERVATIONS)
-            time_ns = frame.stamp_ns + number  # a time of its own for every message
+            time_ns = frame.stamp_ns + number  # unique time of each message
             recording.put(f'/{frame.fluoroscope}/target_observations', data, time_ns, time_ns)
-        time.sleep(0.004)  # many flushes, and so chunks
+        time.sleep(0.004)  # gives many flushes and thus many chunks
     recording.stop()
     return next(path.glob('*.mcap'))
 
 
 def chunks_of(path: Path) -> list[Chunk]:
-    """Return the chunks of a file with their messages, from its index."""
+    """Return the chunks of a file with their messages, using its index."""
     with open(path, 'rb') as file:
         reader = make_reader(file)
         messages = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A user of the graph on a host of its own: python -m benchmarks.faults.host_client.
+"""A user of the graph on its own host: python -m benchmarks.faults.host_client.
 
-Takes a command a line on standard input, and answers each with a line of JSON:
+Read one command per line from standard input, and answer each with a line of JSON:
 
 state                    collected exposures, latched messages and diagnostics so far
-calibrate MODEL          what the service calibrate answers
-step NODE NODE           once players that were started paused have published a message each
-go NODE NODE             go on playing, of players that were started paused
-begin                    forget all messages of streams
-result                   messages of streams since then: numbers, gaps, latency
+calibrate MODEL          response of the service calibrate
+step NODE NODE           publish one message from each of these paused players, and wait for them
+go NODE NODE             resume these paused players
+begin                    discard all stream messages
+result                   stream messages since then: numbers, gaps, latency
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader
 from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 NAMES = ('a', 'b')
-DEPTH = 5000  # what is lost is not lost here
+DEPTH = 5000  # deep enough that this queue loses nothing
 ANSWER_S = 120.0
-REPEAT_S = 2.0  # after which a request that is not answered is sent again
+REPEAT_S = 2.0  # interval after which an unanswered request is sent again
 
 
 class HostClient:
@@ -120,7 +120,7 @@ class HostClient:
             self._diagnostics[status.name] = status.message
 
     def answer(self, words: list[str]) -> dict[str, Any]:
-        """Do what a command asks for."""
+        """Execute a command."""
         commands: dict[str, Callable[..., dict[str, Any]]] = {
             'state': self._state,
             'calibrate': self._run_calibration,
@@ -149,20 +149,20 @@ class HostClient:
     def _step(self, *players: str) -> dict[str, Any]:
         for name in players:
             self._call(self._node.create_client(Trigger, f'{name}/step'), Trigger.Request())
-        # They have found their readers, and nothing holds them back now.
+        # The players have discovered their readers, and are not blocked any more.
         self._wait(lambda: len(self._came) >= len(players))
         return {}
 
     def _go(self, *players: str) -> dict[str, Any]:
         clients = [self._node.create_client(SetBool, f'{name}/pause') for name in players]
-        for client in clients:  # they are paused: this only makes sure that they answer
+        for client in clients:  # already paused: this only ensures that they respond
             self._call(client, SetBool.Request(data=True))
         futures = [client.call_async(SetBool.Request(data=False)) for client in clients]
         self._wait(lambda: all(future.done() for future in futures))
         return {}
 
     def _call(self, client: Any, request: Any) -> Any:
-        """Return the answer of a service, asked again where the server did not know us yet."""
+        """Return the response of a service; repeat the request until the server knows us."""
         futures: list[Any] = []
         asked = 0.0
 
@@ -191,7 +191,7 @@ class HostClient:
             self._spinner.spin_once(timeout_sec=0.05)
 
     def spin(self) -> None:
-        """Spin, and answer commands until there are no more."""
+        """Spin and answer commands until the input ends."""
         text = b''
         while rclpy.ok():
             self._spinner.spin_once(timeout_sec=0.02)
@@ -207,7 +207,7 @@ class HostClient:
 
 
 def _figures(came: list[tuple[int, int, int]]) -> dict[str, Any]:
-    """Numbers of messages, and their latency from publication to reception [ms]."""
+    """Return message counts and latency from publication to reception [ms]."""
     numbers = np.array([number for number, _, _ in came])
     sent_ns = np.array([sent for _, sent, _ in came], np.int64)
     received_ns = np.array([received for _, _, received in came], np.int64)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The graph on several hosts: links that lose, delay and break.
+"""The graph on several hosts, with links that lose frames, delay them and break.
 
 Fluoroscope a, fluoroscope b, the calibration node, and the tracking (correction, reconstruction
-and a client) each have a host with an address of its own, joined by benchmarks.faults.network.
+and a client) each run on a host with its own address, connected by benchmarks.faults.network.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Client:
         return self._answer()
 
     def wait(self, condition: Callable[[dict[str, Any]], object], what: str) -> float:
-        """Wait until a condition of the state is true; returns the time that it took [s]."""
+        """Wait until a condition of the state is true; return the waiting time [s]."""
         began = time.monotonic()
         while True:
             state = self.ask('state')
@@ -133,7 +133,7 @@ class Hosts:
         return self._stack.enter_context(Process(words, log))
 
     def start_graph(self, phantom: Path) -> Client:
-        """Start all but the fluoroscopes; returns the client on the host of the tracking."""
+        """Start everything but the fluoroscopes; return the client on the tracking host."""
         self.start(
             'calibration',
             'calibration_node',
@@ -148,7 +148,7 @@ class Hosts:
         return self._stack.enter_context(Client(self.network, host))
 
     def play(self, bag: Path, readers: int, **parameters: object) -> list[Process]:
-        """Play what each fluoroscope saw on its own host."""
+        """Play the frames of each fluoroscope on its own host."""
         return [
             self.start(
                 name,
@@ -159,14 +159,14 @@ class Hosts:
                     'wait_for_readers': readers,
                     **parameters,
                 },
-                {'__node': f'player_{name}'},  # a name of its own for its services
+                {'__node': f'player_{name}'},  # a unique name for its services
             )
             for name in NAMES
         ]
 
 
 def run(folder: Path, count: int, seed: int) -> str:
-    """Run the graph on hosts; returns the sections of the report.
+    """Run the graph on several hosts; return the sections of the report.
 
     count: duration of each stream [s].
     """
@@ -180,7 +180,7 @@ def run(folder: Path, count: int, seed: int) -> str:
 
 
 def _write_stream(bag: Path, seconds: float, rate_hz: float, seed: int) -> int:
-    """Write a recording of moving markers; returns the number of exposures."""
+    """Write a recording of moving markers; return the number of exposures."""
     start = StreamStart(10**18)
     rig = virtual_rig(1)
     frames = simulate_tracking(rig, seconds, rate_hz, seed, 0.25, start, clusters=5).frames
@@ -189,7 +189,7 @@ def _write_stream(bag: Path, seconds: float, rate_hz: float, seed: int) -> int:
 
 
 def _sections(hosts: Hosts, seconds: int, sent: int) -> list[str]:
-    """Run the graph on the hosts of a network; returns the sections of the report."""
+    """Run the graph on the hosts of a network; return the sections of the report."""
     client = hosts.start_graph(ROOT / 'bags' / 'phantom.csv')
     calibration = _calibrated(hosts, client)
     rows = [_noted(_streamed(hosts, client, quality, sent)) for quality in QUALITIES]
@@ -231,13 +231,13 @@ def _sections(hosts: Hosts, seconds: int, sent: int) -> list[str]:
 
 
 def _noted(row: list[str]) -> list[str]:
-    """Show a row as soon as it is there: all of them take minutes."""
+    """Show a row as soon as it is available, since all rows take minutes."""
     print('  ' + ' | '.join(row), file=sys.stderr, flush=True)
     return row
 
 
 def _calibrated(hosts: Hosts, client: Client) -> str:
-    """Collect the exposures of bags/calibration, and calibrate; returns a sentence."""
+    """Collect the exposures of bags/calibration, and calibrate; return a sentence."""
     hosts.play(ROOT / 'bags' / 'calibration', 3, rate=5.0)
     client.wait(
         lambda state: [state['exposures'].get(name) for name in NAMES] == [15, 15], '15 exposures'
@@ -264,8 +264,8 @@ def _name(quality: Quality) -> str:
 
 
 def _streamed(hosts: Hosts, client: Client, quality: Quality, sent: int) -> list[str]:
-    """Stream over a link of this quality; returns a row of the report."""
-    hosts.network.set_quality(Quality())  # discovery is measured elsewhere
+    """Stream over a link of this quality; return a row of the report."""
+    hosts.network.set_quality(Quality())  # discovery is measured separately
     client.ask('begin')
     players = hosts.play(hosts.folder / 'tracking', 3, start_paused='true')
     client.ask('step', *(f'player_{name}' for name in NAMES))
@@ -312,7 +312,7 @@ def _joined_late(hosts: Hosts, quality: Quality) -> list[str]:
 
 
 def _cut_off(hosts: Hosts, client: Client, host: str, seconds: float) -> list[str]:
-    """Cut a host off during a stream; returns a row of the report."""
+    """Disconnect a host during a stream; return a row of the report."""
     hosts.network.set_quality(Quality())
     client.ask('begin')
     players = hosts.play(hosts.folder / 'long', 3, start_paused='true')

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""kill -9 at random moments: every folder is whole, and nothing goes on running.
+"""kill -9 at random moments: every folder stays consistent, and no process keeps running.
 
-Four programs are killed: calibrate and simulate over an earlier result, bag record, and the
-calibration node while a job runs; `extract` for its worker processes.
+Four programs are killed: calibrate and simulate while replacing an earlier result, bag record, and
+the calibration node during a job; `extract` is killed to check its worker processes.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from .calibrating import JobClient
 from .processes import LEFT_S, Process, command, node
 
 EXTRACT_KILLS = 10
-SIZES = (5, 6)  # exposures of the two calibrations that follow each other
-RECORD_S = 4.0  # within which a recorder is killed
-FLUSH_S = 1.0  # the flush period; disk and scheduling add to what is lost
+SIZES = (5, 6)  # exposures of the two alternating calibrations
+RECORD_S = 4.0  # time within which a recorder is killed
+FLUSH_S = 1.0  # flush period; disk and scheduling add to the loss
 RECORDED_HZ = 100.0
 
 
 @dataclass
 class Tally:
-    """What kills of one program found.
+    """Results of killing one program.
 
     Attributes
     ----------
     states : Counter
-        What the folder held after each kill.
+        Content of the folder after each kill.
     faults : list of str
-        What must not be.
+        Violations of the guarantees.
     hit : int
         Kills before the program had ended by itself.
     """
@@ -73,7 +73,7 @@ class Tally:
 
 
 def run(folder: Path, count: int, seed: int) -> str:
-    """Kill each program `count` times; returns the section of the report."""
+    """Kill each program `count` times; return the section of the report."""
     kills: dict[str, Callable[[Path, int, random.Random], Tally]] = {
         'calibrate': kill_calibrate,
         'simulate': kill_simulate,
@@ -110,9 +110,9 @@ def kill_repeatedly(
     count: int,
     rng: random.Random,
 ) -> Tally:
-    """Run commands in turn that replace one folder, and kill them.
+    """Run commands alternately that replace one folder, and kill them.
 
-    state() returns which command's content the folder holds, and raises where it is none.
+    state() returns which command's content the folder holds, and raises if it is neither's.
     """
     tally = Tally()
     seconds = []
@@ -123,7 +123,7 @@ def kill_repeatedly(
                 raise SystemExit(process.output)
         seconds.append(time.monotonic() - began)
     for number in range(count):
-        # Half of the kills come in the last third, where files are written.
+        # Half of the kills fall in the last third, in which files are written.
         part = rng.uniform(0.0, 1.05) if number % 2 else rng.uniform(0.6, 1.05)
         with Process(commands[number % 2], folder / 'log') as process:
             time.sleep(part * min(seconds))
@@ -159,9 +159,9 @@ def kill_calibrate(folder: Path, count: int, rng: random.Random) -> Tally:
 
 
 def whole_result(path: Path) -> str:
-    """Return which calibration a result folder holds. Raises DataError or ValueError."""
+    """Return which calibration a result folder holds. Raise DataError or ValueError if invalid."""
     calibrations = load_calibrations(path)
-    request = read_request(path, calibrations)  # checks that the sources are theirs
+    request = read_request(path, calibrations)  # checks that the sources match the calibrations
     document = json.loads((path / 'result.json').read_text())
     numbers = {len(each['exposures']) for each in document['fluoroscopes'].values()}
     numbers |= {len(frames) for frames in request.frames.values()}
@@ -209,7 +209,7 @@ def contents(path: Path) -> dict[str, bytes]:
 
 
 def kill_extract(folder: Path, count: int, rng: random.Random) -> Tally:
-    """The workers of a killed command end; nothing of the output is there."""
+    """The workers of a killed command end; no output exists."""
     simulate(folder / 'rig', SimulationOptions(1, 6, 0, 0.0, images='clean'))
     out = folder / 'a.csv'
     words = command(
@@ -234,7 +234,7 @@ def kill_extract(folder: Path, count: int, rng: random.Random) -> Tally:
 
 
 def kill_recorder(folder: Path, count: int, rng: random.Random) -> Tally:
-    """All but the last second of a killed recording is recovered, without a gap."""
+    """Check that all but the last second of a killed recording is recovered without gaps."""
     tally = Tally()
     feed = node('simulator_node', {'scene': 'markers', 'rate': RECORDED_HZ})
     with Process(feed, folder / 'feed.log'):
@@ -257,7 +257,7 @@ def kill_recorder(folder: Path, count: int, rng: random.Random) -> Tally:
 
 
 def _state_of_recording(bag: Path, out: Path, killed_ns: int, tally: Tally) -> str:
-    """Return what is left of a killed recording, and note what must not be."""
+    """Return the remaining content of a killed recording, and record violations."""
     if not bag.exists():
         return 'not begun'
     try:
@@ -286,7 +286,7 @@ def _state_of_recording(bag: Path, out: Path, killed_ns: int, tally: Tally) -> s
 
 
 def kill_node(folder: Path, count: int, rng: random.Random) -> Tally:
-    """Kill the node between the request and some time after the answer, then restart it."""
+    """Kill the node between the request and some time after the response, then restart it."""
     tally = Tally()
     out = folder / 'calibrations'
     parameters = {'phantom': folder / 'rig' / 'phantom.csv', 'calibration_directory': out}
@@ -307,7 +307,7 @@ def kill_node(folder: Path, count: int, rng: random.Random) -> Tally:
                     tally.kills += 1
                 process.kill()
                 tally.left += len(process.left())
-                # Python itself complains if it is killed while it starts a process.
+                # Python itself prints a traceback if it is killed while starting a process.
                 if 'Traceback' in process.output and 'spawn_main' not in process.output:
                     tally.faults.append(process.output[-500:])
             if number < 0:

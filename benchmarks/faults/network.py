@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hosts of their own on one machine: network namespaces, joined by a switch of our own.
+"""Several hosts on one machine: network namespaces connected by a switch of our own.
 
-Each host is a network namespace whose only link is a TAP device. The switch, a process, forwards
-the Ethernet frames between them, loses and delays them as told, and counts them. So nothing
-reaches another host but through the switch, whatever the kernel offers for traffic control.
-Needs the rights to make namespaces and TAP devices (root).
+Each host is a network namespace whose only link is a TAP device. The switch process forwards the
+Ethernet frames between them, drops and delays them as requested, and counts them. All traffic
+between hosts passes through the switch, whatever the kernel offers for traffic control.
+Requires the rights to create namespaces and TAP devices (root).
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ SWITCH = Path(__file__).with_name('switch.py')
 
 @dataclass(frozen=True)
 class Quality:
-    """How the switch treats frames: share that is lost, and delay of the others [s]."""
+    """Treatment of frames by the switch: fraction dropped, and delay of the others [s]."""
 
     loss: float = 0.0
     delay_s: float = 0.0
 
 
 class Network:
-    """Hosts by name, as a context manager; only what it has made is removed.
+    """Hosts by name, as a context manager that removes only what it has created.
 
-    profile: of Fast DDS, for all hosts. Raises OSError where namespaces or TAP devices cannot be
-    made.
+    profile: Fast DDS profile of all hosts. Raises OSError if namespaces or TAP devices cannot be
+    created.
     """
 
     def __init__(self, hosts: Sequence[str], seed: int = 1, profile: Path | None = None) -> None:
@@ -69,8 +69,8 @@ class Network:
                 descriptors.append(self._make(host, number + 1))
             self._pipe, other = multiprocessing.Pipe()
             passed = [other.fileno(), *descriptors]
-            # A program of its own: a fork of a process with ROS contexts crashes when it
-            # collects them as garbage.
+            # Run it as a separate program: a fork of a process with ROS contexts crashes when it
+            # garbage-collects them.
             self._process = subprocess.Popen(
                 [sys.executable, SWITCH, str(self._seed), *map(str, passed)], pass_fds=passed
             )
@@ -84,7 +84,7 @@ class Network:
         return self
 
     def _make(self, host: str, number: int) -> int:
-        """Make a namespace with one link; returns the other end of the link."""
+        """Create a namespace with one link; return the other end of the link."""
         namespace = self.namespace(host)
         _ip('netns', 'add', namespace)
         self._made.append(namespace)
@@ -127,9 +127,9 @@ class Network:
         self._made.clear()
 
     def run_in(self, host: str, words: Sequence[object]) -> list[object]:
-        """Return the words that run a program on a host.
+        """Return the command line that runs a program on a host.
 
-        Processes of different hosts never share memory: only UDP is used.
+        Processes of different hosts never share memory; they only use UDP.
         """
         variables = ['ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET', 'FASTDDS_BUILTIN_TRANSPORTS=UDPv4']
         if self.profile is not None:
@@ -137,15 +137,15 @@ class Network:
         return ['ip', 'netns', 'exec', self.namespace(host), 'env', *variables, *words]
 
     def set_quality(self, quality: Quality) -> None:
-        """Lose and delay frames from now on."""
+        """Set the loss and delay of frames from now on."""
         self._ask('quality', (quality.loss, quality.delay_s))
 
     def cut_off(self, host: str, is_off: bool = True) -> None:
-        """Pull the cable of a host, or plug it in again."""
+        """Disconnect a host, or reconnect it."""
         self._ask('carrier', (self.hosts.index(host), is_off))
 
     def forwarded(self) -> Counter[tuple[str, str]]:
-        """Return how many frames went from a host to another one, by (from, to)."""
+        """Return the number of forwarded frames by (from, to)."""
         counts: Counter[tuple[int, int]] = self._ask('counts', None)
         return Counter(
             {(self.hosts[one], self.hosts[other]): n for (one, other), n in counts.items()}

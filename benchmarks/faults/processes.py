@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Processes of the project that are killed, interrupted and looked after."""
+"""Processes of the project that are killed, interrupted and monitored."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from types import TracebackType
 
 ROOT = Path(__file__).resolve().parents[2]
 POLL_S = 0.005
-LEFT_S = 2.0  # after which nothing that a process has started runs any more
+LEFT_S = 2.0  # time after which no process started by the program may still run
 
 
 class Process:
-    """A process in a session of its own, with its output in a file; a context manager."""
+    """A process in its own session, with its output in a file; a context manager."""
 
     def __init__(self, command: Sequence[object], log: Path) -> None:
         self._log = log
@@ -32,14 +32,14 @@ class Process:
                 stdout=out,
                 stderr=out,
                 start_new_session=True,
-                # The sources beside this file, also where others are installed.
+                # Use the sources next to this file, even if others are installed.
                 env={**os.environ, 'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}'},
             )
         self.pid = self._process.pid
 
     @property
     def output(self) -> str:
-        """What the process has written."""
+        """Output of the process so far."""
         return self._log.read_text(errors='replace')
 
     @property
@@ -47,20 +47,20 @@ class Process:
         return self._process.poll() is None
 
     def send(self, number: int) -> None:
-        """Send a signal to the process, not to those that it has started."""
+        """Send a signal to the process, but not to its children."""
         self._process.send_signal(number)
 
     def wait(self, seconds: float = 60.0) -> int:
-        """Return the exit status; negative: the number of the signal that ended it."""
+        """Return the exit status; if negative, the number of the signal that ended the process."""
         return self._process.wait(seconds)
 
     def kill(self) -> None:
-        """Kill the process as a power failure would, not those that it has started."""
+        """Kill the process as a power failure would, but not its children."""
         self._process.kill()
         self._process.wait()
 
     def left(self, seconds: float = LEFT_S) -> list[int]:
-        """Return what still runs of the process and its children after a time at most."""
+        """Return the processes of the session that still run after at most this time."""
         end = time.monotonic() + seconds
         while True:
             left = members(self.pid)
@@ -83,13 +83,13 @@ class Process:
 
 
 def members(session: int) -> list[int]:
-    """Return the processes of a session that run."""
+    """Return the running processes of a session."""
     found = []
     for name in os.listdir('/proc'):
         if name.isdigit():
             try:
                 stat = Path('/proc', name, 'stat').read_text()
-            except OSError:  # ended meanwhile
+            except OSError:  # it has ended in the meantime
                 continue
             state, _, _, of = stat.rpartition(')')[2].split()[:4]
             if int(of) == session and state not in 'ZX':
@@ -98,7 +98,7 @@ def members(session: int) -> list[int]:
 
 
 def command(*arguments: object) -> list[object]:
-    """Return the words that run the command fluoro-calib."""
+    """Return the command line that runs the command fluoro-calib."""
     return [sys.executable, '-m', 'fluoro_calib_ros.cli', *arguments]
 
 
@@ -107,7 +107,7 @@ def node(
     parameters: Mapping[str, object] | None = None,
     remaps: Mapping[str, str] | None = None,
 ) -> list[object]:
-    """Return the words that run a node as its console script does."""
+    """Return the command line that runs a node as its console script does."""
     script = Path(sys.prefix, 'bin', name)
     words: list[object] = [sys.executable]
     if script.exists():

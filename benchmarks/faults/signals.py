@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""SIGINT and SIGTERM at random moments of every node, during the start, too."""
+"""SIGINT and SIGTERM at random moments of every node, including its start-up."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from ..timing import section
 from .processes import ROOT, Process, node
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-START_S = 3.0  # within which a process is interrupted during its start
-RUNNING_S = 2.0  # within which it is interrupted after it
+START_S = 3.0  # time within which a process is interrupted during start-up
+RUNNING_S = 2.0  # time within which it is interrupted after start-up
 PHASES = ('start', 'running')
 PHANTOM = {'phantom': ROOT / 'bags' / 'phantom.csv'}
 
 
 def nodes_under_test(folder: Path) -> dict[str, Callable[[int], Mapping[str, object]]]:
-    """Return the parameters of all nodes; called with the number of the run."""
+    """Return functions from the run number to the parameters of a node, for all nodes."""
     calibrated = {'calibration_directory': folder / 'calibrated'}
     return {
         'calibration_node': lambda _: {**PHANTOM, **calibrated},
@@ -45,11 +45,11 @@ def nodes_under_test(folder: Path) -> dict[str, Callable[[int], Mapping[str, obj
 
 
 def run(folder: Path, count: int, seed: int) -> str:
-    """Interrupt every node `count` times with each signal; returns the section of the report."""
+    """Interrupt every node `count` times with each signal; return the section of the report."""
     (folder / 'calibrated').mkdir()
     rows = []
     with ExitStack() as stack:
-        # A stream for the nodes to be in the middle of.
+        # A stream that keeps the nodes busy.
         feed = node('simulator_node', {'scene': 'markers', 'rate': 60.0})
         stack.enter_context(Process(feed, folder / 'feed.log'))
         for name, parameters in nodes_under_test(folder).items():
@@ -91,13 +91,13 @@ class _Test:
     def row(
         self, parameters: Callable[[int], Mapping[str, object]], count: int, seed: int
     ) -> list[str]:
-        """Interrupt the node `count` times; returns a row of the report."""
+        """Interrupt the node `count` times; return a row of the report."""
         rng = random.Random(f'{seed} {self.name} {self.number} {self.phase}')
         found: Counter[str] = Counter()
         longest = 0.0
         for run_number in range(count):
             label = f'{self.name}_{self.number.name}_{self.phase}_{run_number}'
-            # A number of its own for every run, for the folders of the recorder.
+            # A unique number of each run, for the folders of the recorder.
             unique = (run_number * 100 + self.number) * 2 + PHASES.index(self.phase)
             words = node(self.name, parameters(unique))
             with Process(words, self.folder / f'{label}.log') as process:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A switch between the TAP devices of hosts, as a program of its own.
+"""A switch between the TAP devices of hosts, run as a separate program.
 
-Loses and delays Ethernet frames as told by the process that has started it, and counts them.
+Drops and delays Ethernet frames as requested by its parent process, and counts them.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ class Switch:
         self._rng = random.Random(seed)
         self._loss = 0.0
         self._delay_s = 0.0
-        self._off: set[int] = set()  # ports without cable
+        self._off: set[int] = set()  # disconnected ports
         self._port_of: dict[bytes, int] = {}  # port by Ethernet address
         self._waiting: list[tuple[float, int, int, int, bytes]] = []
         self._numbers = itertools.count()
         self._counts: Counter[tuple[int, int]] = Counter()
 
     def run(self, pipe: Connection, parent: int) -> None:
-        """Forward frames, and answer the parent, until it has gone."""
+        """Forward frames and answer the parent until it has gone."""
         ports = {device: port for port, device in enumerate(self._devices)}
         while os.getppid() == parent:
             timeout = 0.5
@@ -61,11 +61,11 @@ class Switch:
                 self._deliver(source_port, port, frame)
 
     def _receive(self, source: int) -> None:
-        """Take all frames of a port."""
+        """Receive all frames of a port."""
         while True:
             try:
                 frame = os.read(self._devices[source], FRAME_BYTES)
-            except OSError:  # none is left, or the device is down
+            except OSError:  # no frame is left, or the device is down
                 return
             self._port_of[frame[6:12]] = source
             known = self._port_of.get(frame[:6])
@@ -78,7 +78,7 @@ class Switch:
     def _deliver(self, source: int, port: int, frame: bytes) -> None:
         if source in self._off or port in self._off:
             return
-        with contextlib.suppress(OSError):  # its queue is full, or it is down
+        with contextlib.suppress(OSError):  # its queue is full, or the device is down
             os.write(self._devices[port], frame)
             self._counts[source, port] += 1
 

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of a correction at angles of a C-arm, against what it claims there.
+"""Compare errors of a correction at angles of a C-arm with its claimed covariance there.
 
-Twice for each case of the group `turning` whose angles are given:
+Two comparisons for each case of the group `turning` whose angles are given:
 
-- held: rays of all angles have one interior orientation. The truth is in the gauge of the mean
-  correction over the exposures, and a turn of the sensor at each angle. This is what a correction
-  states.
-  A claim that holds has an NSE of one in the mean, but few independent errors stand for a whole
-  correction: that of one calibration scatters. So it is compared with those of errors that are
-  drawn from the claimed covariance: its rank among them, and the share of them that is above 2.
-- free: each angle has an interior orientation of its own, so the error has no part that one can
-  express. The claim is without its part of a change of the interior orientation.
+- held: rays of all angles have the same interior orientation. The truth is in the gauge of the
+  mean correction over the exposures, with a rotation of the sensor at each angle. This is what a
+  correction states.
+  A valid claim has a mean NSE of one, but a whole correction has few independent errors, so the
+  NSE of a single calibration scatters. It is therefore compared with the NSE of errors that are
+  drawn from the claimed covariance: its rank among them, and the fraction of them above 2.
+- free: each angle has its own interior orientation, so the error has no component that an interior
+  orientation can express. The claim excludes the variance of a change of interior orientation.
 """
 
 import argparse
@@ -40,9 +40,9 @@ from .measure import COVER, calibrated_grid, test_angles
 from .scene import NAMES, draw
 
 FIRST = 101
-MANY = 2.0  # NSE
+MANY = 2.0  # limit of the NSE
 DRAWS = 300
-EVERY = 7  # point of the grid at which errors are drawn
+EVERY = 7  # step between the grid points at which errors are drawn
 HELD_CASES = [case for case in CASES if case.group == 'turning' and case.angle_known]
 
 
@@ -54,7 +54,7 @@ class Errors:
     sd: np.ndarray
 
     def figures(self, name):
-        """NSE, cover95 and RMS of the errors."""
+        """Return NSE, cover95 and RMS of the errors."""
         normalised = np.abs(self.error) / self.sd[:, None]
         return {
             f'{name}_nse': float(np.mean(normalised**2)),
@@ -66,7 +66,7 @@ class Errors:
 
 @contextmanager
 def recorded_fits():
-    """List of (estimated, angles, fit) of the fits to angles within the context."""
+    """Yield a list that collects (estimated, angles, fit) of fits to angles within the context."""
     original = fluoroscope_terms.fit_angles
     fits = []
 
@@ -83,7 +83,7 @@ def recorded_fits():
 
 
 def without_interior(estimated, angles, fit):
-    """Field of angles that states no variance of a change of the interior orientation."""
+    """Return an angle field without the variance of a change of the interior orientation."""
     count = len(fit.effects.mean) // HARMONICS
     kept = np.tile(np.arange(count) < TERMS, HARMONICS).astype(float)
     effects = replace(
@@ -95,17 +95,17 @@ def without_interior(estimated, angles, fit):
 
 
 def terms_of(estimated):
-    """Function of pixels (n, 2) with the values (n, 2, t) of the terms of exposures."""
+    """Return a function of pixels (n, 2) that evaluates the terms of exposures (n, 2, t)."""
     cubic = Functions(estimated.functions.image_size, CUBIC)
     values = cubic(estimated.uv)
     of_terms = estimated.terms.functions.values
-    # Terms are cubic polynomials: this solution is exact.
+    # Terms are cubic polynomials, so this solution is exact.
     matrices = [np.linalg.lstsq(values, of_terms[:, axis], rcond=None)[0] for axis in (0, 1)]
     return lambda uv: np.stack([cubic(uv) @ matrix for matrix in matrices], axis=1)
 
 
 def drawn_nse(fit, calibration, grid, angles):
-    """NSE (DRAWS,) of errors that are drawn from the covariance that a correction claims.
+    """Return the NSE (DRAWS,) of errors drawn from the covariance that a correction claims.
 
     fit: (estimated, angles, fit) of `recorded_fits`; angles: at which errors are compared.
     """
@@ -133,7 +133,7 @@ def drawn_nse(fit, calibration, grid, angles):
 
 
 def measured(case, seed):
-    """Figures of one case with one seed."""
+    """Return the figures of one case with one seed."""
     scene = draw(case, seed)
     name = NAMES[0]
     with recorded_fits() as fits:
@@ -159,7 +159,7 @@ def measured(case, seed):
 
 
 def table(results):
-    """Rows of a Markdown table: means and medians over the seeds, by case."""
+    """Return the rows of a Markdown table: means and medians over the seeds, by case."""
     lines = [
         '| case | seeds | held: mean NSE | median | > 2 | > 2, drawn | free: mean NSE | median |'
     ]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of a correction at angles of a C-arm, with its interior orientation held, or free."""
+"""Errors of a correction at angles of a C-arm, with fixed or free interior orientation."""
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -13,7 +13,7 @@ TURN_SCALE = 1e-3  # rad
 
 
 class Truth:
-    """True corrections of a camera at pixels (n, 2), in a gauge over the first of them."""
+    """True corrections of a camera at pixels (n, 2), in a gauge over the first `count` of them."""
 
     def __init__(self, camera, pixels, count, interior):
         self.pixels = pixels
@@ -22,15 +22,15 @@ class Truth:
         self.back = np.linalg.inv(_matrix(camera.interior))
 
     def seen_by(self, x, true):
-        """True corrections (n, 2) with the interior orientation and turn x (6,) of the sensor."""
+        """Return true corrections (n, 2) for interior orientation and sensor rotation x (6,)."""
         ideal = np.column_stack([self.pixels - true, np.ones(len(self.pixels))])
         turned = ideal @ (_matrix(x[:3]) @ matrix_from_vector(x[3:]) @ self.back).T
         return self.pixels - turned[:, :2] / turned[:, 2:]
 
     def gauge(self, true, found, held=None):
-        """Orientation (6,) with which corrections and found ones have the same part in the gauge.
+        """Return the orientation (6,) for which true and found corrections agree in the gauge.
 
-        held (3,): interior orientation; None: it is free.
+        held (3,): fixed interior orientation; None: it is free.
         """
         kind = GaugeKind.FULL if held is None else GaugeKind.TURNS
         uv = self.pixels[: self.count]
@@ -53,11 +53,12 @@ def _matrix(k):
 
 
 def errors_at_angles(scene, calibration, uv, grid, angles, free_field=None):
-    """Errors (n, 2) and stated sd (n,) of fluoroscope a at pixels grid (g, 2), for all angles.
+    """Return errors (n, 2) and stated sd (n,) of fluoroscope a at pixels grid (g, 2), all angles.
 
-    uv: image points of the fit. Returns those 'held', where the truth is in the gauge of the mean
-    correction over the exposures and has a turn of the sensor at each angle, and with a field that
-    states no variance of a change of the interior orientation, 'free': see `angle_claims`.
+    uv: image points of the fit. The result has the key 'held', where the truth is in the gauge of
+    the mean correction over the exposures with a rotation of the sensor at each angle. If
+    free_field is given, a field without variance of a change of the interior orientation, the
+    result also has the key 'free': see `angle_claims`.
     """
     pixels = np.concatenate([uv, grid])
     camera = scene.cameras[0]

@@ -21,7 +21,7 @@ from .noise import (
 
 @dataclass(frozen=True)
 class Case:
-    """What a case differs in from the base rig.
+    """Differences of a case from the base rig.
 
     Attributes
     ----------
@@ -35,25 +35,25 @@ class Case:
     noise, false : callable
         Noise and false matches of the image points.
     survey_sd, survey_factor : float
-        Stated standard deviation of the survey [mm], and the true one over it.
+        Stated standard deviation of the survey [mm], and ratio of the true one to it.
     displaced : (int, float)
-        Number of beads out of place, and how far [mm].
+        Number of displaced beads, and their displacement [mm].
     face_mm : float
         Displacement of one side of the phantom in the survey.
     moved : (int, float)
-        Number of exposures in which half of the beads move, and how far [mm].
+        Number of exposures in which half of the beads move, and their motion [mm].
     short : float
-        Share by which the survey is short in one axis.
+        Relative error by which the survey is too short along one axis.
     exchanged_mm : float
         Distance of two beads that are exchanged in the survey, 0 for none.
     late : (float, float)
-        Motion of the phantom until b takes its frame [mm], [rad].
+        Motion of the phantom before b takes its frame [mm], [rad].
     behind : int
-        Exposures that b is behind, by its frame numbers.
+        Lag of b in exposures, according to its frame numbers.
     repeats : int
         Frames of each pose, with mostly the same noise.
     magnified : (int, float)
-        Number of exposures in another magnification, and its factor.
+        Number of exposures with another magnification, and its factor.
     side, c, principal, distance : int, float, (float, float), float
         Image side [px], principal distance over it, offset of the principal point [px of 1024],
         distance of the source [mm].
@@ -64,11 +64,11 @@ class Case:
     arm : float
         Change of the distortion with the angle of the C-arm [px], which differs in every exposure.
     angle_known : bool
-        Whether the exposures come with that angle.
+        Whether this angle is given for the exposures.
     blind : callable, optional
         True where the image, in coordinates 0 to 1, shows no beads.
     sigma_known : bool
-        Whether the image points come with their standard deviation.
+        Whether the standard deviations of the image points are given.
     options : dict
         Options of the calibration.
     faulty : bool
@@ -130,7 +130,7 @@ BARREL = (CurvedScreen(-80), Magnetic(2), ThinPlate(9, 0.8))
 SMOOTH = (CurvedScreen(9), Magnetic(2))
 
 CASES = (
-    # Rigs that should give no trouble.
+    # Rigs that should cause no problems.
     Case('base', 'base'),
     Case('turntable', 'base', poses='turntable'),
     Case('cloud', 'base', phantom=phantoms.cloud),
@@ -198,7 +198,7 @@ CASES = (
         'geometry',
         blind=lambda x: ((x - 0.5) ** 2).sum(axis=1) < 0.03,
     ),
-    # Distortion that varies between exposures: each has another one than is corrected.
+    # Distortion that varies between exposures, so that each differs from the corrected one.
     Case('varying 0.3 px', 'varying', wander=0.3),
     Case('varying 1 px', 'varying', wander=1.0, faulty=True),
     Case('varying 1 px 30 exposures', 'varying', wander=1.0, exposures=30, faulty=True),
@@ -216,7 +216,7 @@ CASES = (
     Case('3 beads 2 mm off', 'survey', displaced=(3, 2.0), faulty=True),
     Case('a face 1 mm off', 'survey', face_mm=1.0, faulty=True),
     Case('moved in an exposure', 'survey', moved=(1, 1.0), faulty=True),
-    # Recordings and surveys that are plausible, and wrong.
+    # Recordings and surveys that are plausible but wrong.
     Case('an axis 0.2 % short', 'confused', short=0.002, faulty=True),
     Case('two beads exchanged', 'confused', exchanged_mm=5.0, faulty=True),
     Case('b a frame late', 'confused', late=(1.5, 0.005), faulty=True, both=True),

@@ -12,38 +12,38 @@ from dataclasses import dataclass
 import numpy as np
 
 ITERATIONS = 20
-STEP_PX = 0.5  # of the numerical derivatives
+STEP_PX = 0.5  # step of the numerical derivatives
 TOLERANCE_PX = 1e-9
-SIDE = 1024.0  # image side for which sizes in pixels are declared
+SIDE = 1024.0  # image side to which sizes declared in pixels refer
 
 
 @dataclass(frozen=True)
 class CurvedScreen:
-    """Pincushion (or barrel, where negative) of a curved input screen; size at the rim [px]."""
+    """Pincushion (if negative, barrel) of a curved input screen; size at the rim [px]."""
 
     size: float
 
     def draw(self, rng):
-        """Parameters: size and centre."""
+        """Draw size and centre."""
         return self.size * rng.uniform(0.9, 1.1), rng.uniform(-0.06, 0.06, 2)
 
     def __call__(self, drawn, x):
         size, centre = drawn
         d = x - centre
         r = np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12)
-        if size < 0:  # the tangent would fold the corners inwards
+        if size < 0:  # a tangent would fold the corners inwards
             return size * d / r * (0.7 * r - np.arctan(0.7 * r)) / 0.0893
         return size * d / r * (np.tan(0.7 * np.minimum(r, 1.9)) - 0.7 * r) / 0.1423
 
 
 @dataclass(frozen=True)
 class Magnetic:
-    """S-curve of a magnetic field: a turn that depends on the radius, and a bent line [px]."""
+    """S-curve of a magnetic field: a rotation that depends on the radius, and a bent line [px]."""
 
     size: float
 
     def draw(self, rng):
-        """Turn, its radius, size and direction of the bend."""
+        """Draw rotation, its radius, and size and direction of the bend."""
         return rng.normal(0, 1), rng.uniform(0.4, 0.9), rng.normal(0, 1), rng.uniform(0, np.pi)
 
     def __call__(self, drawn, x):
@@ -64,7 +64,7 @@ class Bumps:
     height: float
 
     def draw(self, rng):
-        """Places, widths and heights."""
+        """Draw positions, widths and heights."""
         return (
             rng.uniform(-1, 1, (self.count, 2)),
             self.width / (SIDE / 2) * rng.uniform(0.7, 1.4, self.count),
@@ -81,13 +81,13 @@ class Bumps:
 
 @dataclass(frozen=True)
 class ThinPlate:
-    """Thin-plate splines over random knots, of an RMS size [px]."""
+    """Thin-plate splines over random knots with a given RMS size [px]."""
 
     knots: int
     size: float
 
     def draw(self, rng):
-        """Knots and weights."""
+        """Draw knots and weights."""
         return rng.uniform(-1.1, 1.1, (self.knots, 2)), rng.normal(0, 1, (self.knots, 2))
 
     def __call__(self, drawn, x):
@@ -108,14 +108,14 @@ class ThinPlate:
 
 @dataclass(frozen=True)
 class Waves:
-    """Plane waves of a wavelength [px] and an amplitude [px]."""
+    """Plane waves with a given wavelength [px] and amplitude [px]."""
 
     wavelength: float
     amplitude: float
     count: int = 3
 
     def draw(self, rng):
-        """Directions, phases and amplitudes."""
+        """Draw directions, phases and amplitudes."""
         angle = rng.uniform(0, np.pi, self.count)
         vectors = np.stack([np.cos(angle), np.sin(angle)])
         amplitude = self.amplitude * rng.uniform(-1, 1, (self.count, 2)) / np.sqrt(self.count)
@@ -128,13 +128,13 @@ class Waves:
 
 @dataclass(frozen=True)
 class Step:
-    """A jump [px] across a line, over a width [px], as at the seam of two fibre plates."""
+    """A jump [px] across a line, within a width [px], as at the seam of two fibre plates."""
 
     jump: float
     width: float
 
     def draw(self, rng):
-        """Line and direction of the jump."""
+        """Draw line and direction of the jump."""
         angle = rng.uniform(0, 2 * np.pi, 2)
         return angle[0], rng.uniform(-0.3, 0.3), [np.cos(angle[1]), np.sin(angle[1])]
 
@@ -147,7 +147,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Distortion:
-    """A sum of parts with drawn parameters, for an image of a side [px]."""
+    """A sum of parts with drawn parameters, for an image with a given side [px]."""
 
     parts: tuple
     drawn: tuple
@@ -155,11 +155,11 @@ class Distortion:
 
     @classmethod
     def of(cls, parts, rng, side):
-        """Draw a distortion."""
+        """Draw a random distortion."""
         return cls(tuple(parts), tuple(part.draw(rng) for part in parts), float(side))
 
     def displacement(self, ideal):
-        """Displacements (n, 2) [px] of ideal image points (n, 2)."""
+        """Return displacements (n, 2) [px] of ideal image points (n, 2)."""
         x = (ideal - (self.side - 1) / 2) / (self.side / 2)
         out = np.zeros_like(ideal)
         for part, drawn in zip(self.parts, self.drawn):
@@ -167,11 +167,11 @@ class Distortion:
         return out * self.side / SIDE
 
     def observed(self, ideal):
-        """Observed pixels (n, 2) of ideal ones."""
+        """Return observed pixels (n, 2) of ideal ones."""
         return ideal + self.displacement(ideal)
 
     def correction(self, observed):
-        """Corrections (n, 2) [px] of observed pixels: observed - ideal."""
+        """Return corrections (n, 2) [px] of observed pixels: observed - ideal."""
         ideal = observed - self.displacement(observed)
         for _ in range(ITERATIONS):
             misclosure = observed - self.observed(ideal)
@@ -181,7 +181,7 @@ class Distortion:
         return observed - ideal
 
     def _slopes(self, ideal):
-        """Derivatives (n, 2, 2) of the observed pixels by the ideal ones."""
+        """Return derivatives (n, 2, 2) of the observed pixels with respect to the ideal ones."""
         steps = STEP_PX * np.eye(2)
         columns = [self.observed(ideal + step) - self.observed(ideal - step) for step in steps]
         return np.stack(columns, axis=2) / (2 * STEP_PX)
@@ -189,12 +189,12 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Wander:
-    """Change of a distortion from exposure to exposure: smooth, of a size [px] at the rim."""
+    """Smooth change of a distortion between exposures, of a given size [px] at the rim."""
 
     size: float
 
     def draw(self, rng):
-        """Turn with radius, pincushion, bend and shear of one exposure."""
+        """Draw rotation with radius, pincushion, bend and shear of one exposure."""
         return rng.normal(0, 1, 6)
 
     def __call__(self, drawn, x):
@@ -209,17 +209,17 @@ class Wander:
 
 @dataclass(frozen=True)
 class Turning:
-    """Change of a distortion with the angle of a C-arm, of a size [px] at the rim.
+    """Change of a distortion with the angle of a C-arm, with a given size [px] at the rim.
 
-    The field of the earth, fixed in the room, turns in the frame of the image; the arm adds a
-    part of twice the angle.
+    The field of the earth is fixed in the room, so it rotates in the image frame; the arm adds a
+    component at twice the angle.
     """
 
     size: float
     angle: float  # rad
 
     def draw(self, rng):
-        """Patterns along and across the field, and of the arm; see `Wander`."""
+        """Draw patterns along and across the field, and of the arm; see `Wander`."""
         return [Wander(1.0).draw(rng) for _ in range(3)]
 
     def __call__(self, drawn, x):

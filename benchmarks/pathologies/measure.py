@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of a calibration out of sample, against its claims and against the oracle's."""
+"""Out-of-sample errors of a calibration, relative to its claims and to the oracle's errors."""
 
 from dataclasses import dataclass
 
@@ -16,24 +16,24 @@ from .scene import NAMES
 RESECTION_STEPS = 6
 INTERSECTION_STEPS = 4
 GRID = 31
-ANGLES = 4  # of the C-arm at which a correction is compared with the truth
-MIN_POINTS = 6  # of a test pose
+ANGLES = 4  # C-arm angles at which a correction is compared with the truth
+MIN_POINTS = 6  # minimum number of points of a test pose
 SAMPLE = 1000  # image points whose joint covariance is used
 COVER = 1.96  # standard deviations of a 95 % interval
-FAR_MM = 0.3  # error of a point that a user would doubt
+FAR_MM = 0.3  # error that would make a user doubt a point
 FAR_SDS = 4.0
 
 
 @dataclass(frozen=True)
 class Truth:
-    """A camera as `truth_in_gauge` takes it: interior orientation and correction of pixels."""
+    """A camera with the interface of `truth_in_gauge`: interior orientation and correction."""
 
     interior: np.ndarray
     distortion: object
 
 
 def resect(rays, points, rotation, source):
-    """Rotation and source that fit rays (n, 2) of points (n, 3) best, from approximate ones."""
+    """Refine rotation and source to fit rays (n, 2) of points (n, 3), from approximate values."""
     for _ in range(RESECTION_STEPS):
         x = (points - source) @ rotation.T
         inverse = 1 / x[:, 2]
@@ -53,7 +53,7 @@ def resect(rays, points, rotation, source):
 
 
 def intersect(rays, exteriors, points):
-    """Points (n, 3) from the rays (n, 2) of two fluoroscopes, from approximate ones."""
+    """Refine points (n, 3) to fit the rays (n, 2) of two fluoroscopes, from approximate values."""
     for _ in range(INTERSECTION_STEPS):
         jacobian = []
         misclosure = []
@@ -71,9 +71,9 @@ def intersect(rays, exteriors, points):
 
 
 def out_of_sample(scene, corrected, seed):
-    """RMS error [px] of noise-free test points; errors (n, 3) [mm] of stereo points with noise.
+    """Return RMS error [px] of noise-free test points; errors (n, 3) [mm] of noisy stereo points.
 
-    corrected(f, observed, angle) returns rays (n, 2), c and bool (n,) of the points that are used;
+    corrected(f, observed, angle) returns rays (n, 2), c and a mask (n,) of the points to use;
     angle is that of the C-arm [rad].
     """
     rng = np.random.default_rng([seed, 5])
@@ -88,13 +88,13 @@ def out_of_sample(scene, corrected, seed):
             here = camera.at(scene.case, angle)
             observed = here.distortion.observed(camera.ideal(scene.true_mm, pose))
             on = ((observed > 0) & (observed < scene.case.side - 1)).all(axis=1)
-            # Noise is of the pixels that are observed: a correction may stretch the image.
+            # Add the noise to observed pixels, because a correction may stretch the image.
             noisy = observed + rng.normal(0, sd, observed.shape)
             both, c, inside = corrected(f, np.concatenate([observed, noisy]), angle)
             ray, noisy_ray = np.split(both, 2)
             on &= inside[: len(observed)]
             used &= on
-            if on.sum() < MIN_POINTS:  # the angle of the C-arm is beyond those that are calibrated
+            if on.sum() < MIN_POINTS:  # the C-arm angle is beyond the calibrated ones
                 break
             exterior = resect(ray[on], scene.true_mm[on], *camera.exterior(pose))
             x = (scene.true_mm - exterior[1]) @ exterior[0].T
@@ -110,7 +110,7 @@ def out_of_sample(scene, corrected, seed):
 
 
 def ratios(scene, result, oracle, seed):
-    """Ratio of image and stereo errors to those of the oracle with interiors (2, 3)."""
+    """Return the ratio of image and stereo errors to those of the oracle with interiors (2, 3)."""
     models = [result.calibrations[name] for name in NAMES]
     inside_of = {}
 
@@ -139,26 +139,27 @@ def ratios(scene, result, oracle, seed):
 
 
 def _far(errors):
-    """Return the share of errors (n, 3) that are longer than FAR_MM."""
+    """Return the fraction of errors (n, 3) that are longer than FAR_MM."""
     return float(np.mean(np.linalg.norm(errors, axis=1) > FAR_MM))
 
 
 def claims(scene, result):
-    """NSE and cover95 of correction, points and sources of fluoroscope a.
+    """Return NSE and cover95 of correction, points and sources of fluoroscope a.
 
-    points_far: object points off by more than FAR_MM and FAR_SDS, of points_number.
+    points_far: object points with errors above FAR_MM and FAR_SDS, out of points_number.
     """
     name = NAMES[0]
     camera = scene.cameras[0]
     run = result.runs[name]
-    # A regression is orthogonal to the gauge over the image points it is fitted to, not all.
+    # A regression is orthogonal to the gauge over the image points to which it is fitted, not over
+    # all.
     network = run.measured.network
     uv = network.uv[run.trained]
     calibration = result.calibrations[name]
     model = calibration.model
     angles = test_angles(scene, calibration)
     if scene.case.arm and scene.case.angle_known and calibration.angle_field is not None:
-        # What it states at an angle is for one interior orientation at all angles.
+        # The sd stated at an angle refers to the same interior orientation at all angles.
         grid = calibrated_grid(scene, calibration)
         error, sd = errors_at_angles(scene, calibration, uv, grid, angles)['held']
     else:
@@ -186,17 +187,17 @@ def claims(scene, result):
 
 
 def calibrated_grid(scene, calibration):
-    """Pixels (g, 2) of a grid within the calibrated area."""
+    """Return grid pixels (g, 2) within the calibrated area."""
     axis = np.linspace(0, scene.case.side - 1, GRID)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     return grid[~calibration.model.outside(grid)]
 
 
 def _errors_at(scene, calibration, uv, angle):
-    """Errors (n, 2) and stated sd (n,) of a correction within the calibrated area, at an angle.
+    """Return errors (n, 2) and stated sd (n,) of a correction in the calibrated area, at an angle.
 
-    uv: image points to which it was fitted. Angle None: unknown, the truth is the mean over the
-    exposures.
+    uv: image points to which it was fitted. If angle is None, it is unknown and the truth is the
+    mean over the exposures.
     """
     grid = calibrated_grid(scene, calibration)
     camera = scene.cameras[0]
@@ -212,7 +213,7 @@ def _errors_at(scene, calibration, uv, angle):
 
 
 def test_angles(scene, calibration):
-    """Angles at which a correction is compared with the truth; None: it is unknown."""
+    """Return angles at which a correction is compared with the truth; None if unknown."""
     field = calibration.angle_field
     if not (scene.case.arm and scene.case.angle_known):
         return [None]
@@ -220,10 +221,11 @@ def test_angles(scene, calibration):
 
 
 def independent_errors(run, model):
-    """Number of independent errors in the claimed covariance of a correction, at image points.
+    """Return the number of independent errors in the claimed covariance of a correction.
 
-    An NSE of so many errors scatters as chi squared over its degrees of freedom (Box 1954, Theorem
-    3.1). None for a model that is not estimated in the adjustment.
+    The covariance is that at the image points. An NSE of so many errors scatters as chi squared
+    over its degrees of freedom (Box 1954, Theorem 3.1). None if the adjustment does not estimate
+    the model.
     """
     network = run.measured.network
     additional = network.additional[0] if network.additional else None

@@ -19,13 +19,13 @@ class Gaussian:
         return observed + rng.normal(0, self.sd, observed.shape)
 
     def sds(self, observed):
-        """Standard deviations (n,) of the image points of an exposure [px]."""
+        """Return standard deviations (n,) of the image points of an exposure [px]."""
         return np.full(len(observed), self.sd)
 
 
 @dataclass(frozen=True)
 class Overlapping:
-    """Gaussian noise of beads in images: less sharp where another bead is near, which is known."""
+    """Gaussian noise of beads in images: larger near another bead, with known sd."""
 
     sd: float = 0.02
     factor: float = 5.0
@@ -35,14 +35,14 @@ class Overlapping:
         return observed + rng.normal(0, 1, observed.shape) * self.sds(observed)[:, None]
 
     def sds(self, observed):
-        """Standard deviations (n,) of the image points of an exposure [px]."""
+        """Return standard deviations (n,) of the image points of an exposure [px]."""
         distance = cKDTree(observed).query(observed, k=2)[0][:, 1]
         return np.where(distance < self.near_px, self.factor, 1.0) * self.sd
 
 
 @dataclass(frozen=True)
 class StudentT:
-    """Noise of Student's t distribution, of a scale [px]."""
+    """Noise with Student's t distribution and a given scale [px]."""
 
     sd: float = 0.2
     nu: float = 3.0
@@ -54,7 +54,7 @@ class StudentT:
 
 @dataclass(frozen=True)
 class WholePixels:
-    """Gaussian noise, then coordinates rounded to whole pixels."""
+    """Gaussian noise, after which coordinates are rounded to whole pixels."""
 
     gaussian: float = 0.1
 
@@ -69,7 +69,7 @@ class WholePixels:
 
 @dataclass(frozen=True)
 class Heteroscedastic:
-    """Gaussian noise that grows from the middle of the image to its rim by a factor."""
+    """Gaussian noise that grows by a factor from the middle of the image to its rim."""
 
     sd: float = 0.15
     factor: float = 3.0
@@ -99,13 +99,13 @@ class ByExposure:
 
 @dataclass(frozen=True)
 class FalseMatches:
-    """A share of false matches: 'near' ones, 'swapped' ids, or 'anywhere' in the image."""
+    """A fraction of false matches: 'near' ones, 'swapped' ids, or 'anywhere' in the image."""
 
     share: float = 0.01
     kind: str = 'near'
 
     def __call__(self, rng, observed, side):
-        """Observed image points (n, 2) with false matches, and True (n,) where they are."""
+        """Return observed image points (n, 2) with false matches, and a mask (n,) of these."""
         n = len(observed)
         wrong = rng.permutation(n)[: rng.binomial(n, self.share)]
         out = observed.copy()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The oracle: a Gaussian adjustment that knows the distortion and has no false matches."""
+"""The oracle: a Gaussian adjustment with known distortion and without false matches."""
 
 import numpy as np
 
@@ -11,11 +11,11 @@ from fluoro_calib_ros.exposures.frame import Frame
 
 from .scene import NAMES
 
-PAD = 1000  # px around the image, so that undistorted image points are on it
+PAD = 1000  # padding around the image [px], so that undistorted image points lie on it
 
 
 def interior_of_oracle(scene):
-    """Interior orientations (2, 3) [px] that the oracle finds."""
+    """Return the interior orientations (2, 3) [px] estimated by the oracle."""
     side = scene.case.side + 2 * PAD
     frames = {name: [] for name in NAMES}
     for image in scene.images:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page docs/how_good/pathologies.md from the results."""
+"""Generate the page docs/how_good/pathologies.md from the results."""
 
 import numpy as np
 from scipy.stats import chi2
@@ -12,8 +12,8 @@ MAX_RATIO = 1.15
 MAX_NSE = 1.5
 HONEST = (0.8, 1.25)
 WORST = 5
-MORE_FAR = 0.02  # share of stereo points
-TAIL = 0.01  # of the distribution of an NSE
+MORE_FAR = 0.02  # fraction of stereo points
+TAIL = 0.01  # tail probability of an NSE
 
 TEXT = """# Pathologies
 
@@ -62,7 +62,7 @@ Means over the seeds.
 
 
 def judge(result, case):
-    """'right', 'wrong' or 'open' for the verdict of a result, '' without one."""
+    """Return 'right', 'wrong' or 'open' for the verdict of a result, '' if there is none."""
     if 'verdict' not in result:
         return ''
     bad = case.faulty or result['ratio'] > MAX_RATIO or result['correction_nse'] > MAX_NSE
@@ -74,7 +74,7 @@ def judge(result, case):
 
 
 def page(results, cases, note=''):
-    """Text of the page."""
+    """Return the text of the page."""
     known = {case.name: case for case in cases}
     results = [r for r in results if r['case'] in known]
     good = [r for r in results if 'said' not in r]
@@ -133,12 +133,12 @@ def _summary(results, good, known):
 
 
 def _significance(results, key, by_case):
-    """Sentence on the scatter between the seeds, and on the cases that it does not explain."""
+    """Describe the scatter between seeds, and the cases that it does not explain."""
     values = {name: [r[key] for r in results if r['case'] == name] for name in by_case}
     freedom = sum(len(of_case) - 1 for of_case in values.values())
     if not freedom:
         return ''
-    # The logarithms scatter alike in all cases; their mean is not that of the values.
+    # Logarithms scatter alike in all cases; their mean differs from that of the values.
     squares = sum(len(of_case) * np.var(np.log(of_case)) for of_case in values.values())
     scatter = np.sqrt(np.exp(squares / freedom) - 1)
     far = []
@@ -153,7 +153,7 @@ def _significance(results, key, by_case):
 
 
 def _far_points(good):
-    """Line on points of calibrations that pass and are off by more than a user would accept."""
+    """Describe points of passing calibrations with errors that a user would not accept."""
     passed = [r for r in good if r.get('verdict') == 'pass' and 'points_far' in r]
     if not passed:
         return []
@@ -176,7 +176,7 @@ def _far_points(good):
 
 
 def _beyond_scatter(results, name):
-    """Line on the NSE of corrections or points that their claimed covariances do not explain."""
+    """Describe the NSE of corrections or points that their claimed covariances do not explain."""
     known = [r for r in results if r.get(f'{name}_freedom')]
     if not known:
         return []

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compare calibrations of two recordings of a rig: how often is a change called significant?
+"""Compare calibrations of two recordings of a rig: how often is a change found significant?
 
 Each pair has one rig, one phantom and one survey, and two recordings with their own poses, noise
-and false matches. With --change, the field of the second has changed by so many pixels, and the
-share called significant is the power of the comparison.
+and false matches. With --change, the field of the second recording differs by so many pixels, and
+the fraction found significant is the power of the comparison.
 """
 
 import argparse
@@ -28,12 +28,12 @@ from .run import chosen, read
 from .scene import NAMES, draw
 
 FIRST = 1001
-# The distortion or the phantom differs between the exposures of these, or they are no good rigs.
+# Excluded: distortion or phantom differs between exposures, or the rig is not a good one.
 LEFT_OUT = ('varying', 'turning', 'survey', 'models')
 
 
 def compared(case, seed, change=0.0):
-    """Return a dict for each fluoroscope of one pair, or one with the refusal."""
+    """Return one dict per fluoroscope of a pair, or a single dict with the refusal."""
     out = {'case': case.name, 'seed': seed, 'change': change}
     try:
         first = _calibrated(draw(case, seed, 1), case)
@@ -90,7 +90,7 @@ def main(arguments=None):
 
 
 def table(rows):
-    """Text of what was called significant, in all and by case."""
+    """Return the results of the comparison as text, for all cases and by case."""
     good = [row for row in rows if 'said' not in row]
     lines = [f'{len(good)} comparisons, {len(rows) - len(good)} pairs refused']
     for name in ('field', 'interior'):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the pathologies, a JSON line for each as soon as it is measured, and write the page."""
+"""Run the pathologies, store each result as a JSON line at once, and write the page."""
 
 import argparse
 import json
@@ -27,7 +27,7 @@ PAGE = Path('docs/how_good/pathologies.md')
 
 
 def measured(case, seed, model=None, verdict=True):
-    """Figures of one case with one seed; 'said' where the calibration is refused."""
+    """Return the figures of one case with one seed; 'said' if the calibration is refused."""
     scene = draw(case, seed)
     options = CalibrationOptions(**{**case.options, **({'model': model} if model else {})})
     request = CalibrationRequest(scene.frames(), scene.phantom, options)
@@ -49,7 +49,7 @@ def measured(case, seed, model=None, verdict=True):
 
 
 def _verdict(outcome):
-    """Verdict on fluoroscope a, on the whole rig where the case says so."""
+    """Return the verdict on fluoroscope a, or on the whole rig if the case requires it."""
     name = NAMES[0]
     used = outcome.request.with_exposures(outcome.result.used_exposures)
     request = replace(used, frames={name: used.frames[name]})
@@ -105,7 +105,7 @@ def main(arguments=None):
 
 
 def chosen(texts):
-    """Cases of names, groups or lists of them with commas, which a name may have, too."""
+    """Return cases by name, group or comma-separated list; names may contain commas, too."""
     known = {word for case in CASES for word in (case.name, case.group)}
     wanted = set()
     for text in texts:
@@ -114,14 +114,14 @@ def chosen(texts):
 
 
 def read(path):
-    """Results of a file of JSON lines."""
+    """Read results from a file of JSON lines."""
     if not path.exists():
         return []
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def summary(result):
-    """One line on a result."""
+    """Return a one-line summary of a result."""
     if 'said' in result:
         return f'{result["case"]} {result["seed"]}: refused: {result["said"]}'
     figures = ' '.join(

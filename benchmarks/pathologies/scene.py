@@ -16,16 +16,16 @@ from .fields import Distortion, Turning, Wander
 
 BETWEEN = np.deg2rad(80)  # angle between the axes of the fluoroscopes
 NAMES = ('a', 'b')
-EDGE = 0.5  # distance [px] of image points from the edge of the image
-MAX_TRIES = 40  # poses that are drawn until one shows the phantom
-ARM = np.deg2rad(90)  # largest angle of the C-arm, either way
+EDGE = 0.5  # minimum distance of image points from the edge of the image [px]
+MAX_TRIES = 40  # maximum number of random poses until one shows the phantom
+ARM = np.deg2rad(90)  # maximum angle of the C-arm, in either direction
 NARROW = np.deg2rad(5)
-FRESH_NOISE = 0.3  # of further frames of a pose, over that of the first
+FRESH_NOISE = 0.3  # noise of further frames of a pose, relative to the first frame
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A fluoroscope: interior (3,) [px], rotation (3, 3) and source (3,) [mm] in the rig."""
+    """A fluoroscope: interior (3,) [px], rotation (3, 3) and source (3,) [mm] in the rig frame."""
 
     name: str
     interior: np.ndarray
@@ -35,7 +35,7 @@ class Camera:
     turning: list | None = None
 
     def at(self, case, angle):
-        """Camera at an angle [rad] of the C-arm."""
+        """Return the camera at an angle [rad] of the C-arm."""
         if angle is None:
             return self
         return replace(
@@ -48,12 +48,12 @@ class Camera:
         )
 
     def exterior(self, pose):
-        """Rotation phantom -> sensor and source in the phantom [mm] for a pose."""
+        """Return the rotation from phantom to sensor and the source in the phantom frame [mm]."""
         turn, shift = pose
         return self.rotation @ turn, turn.T @ (self.source - shift)
 
     def ideal(self, points, pose):
-        """Ideal image points (n, 2) of points (n, 3) of the phantom."""
+        """Return ideal image points (n, 2) of points (n, 3) of the phantom."""
         turn, source = self.exterior(pose)
         x = (points - source) @ turn.T
         return self.interior[:2] + self.interior[2] * x[:, :2] / x[:, 2:]
@@ -61,7 +61,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Image:
-    """Image points of one exposure, with what is true of them.
+    """Image points of one exposure, with the truth.
 
     rows (n,) of the beads; observed (n, 2) with noise and false matches; clean (n, 2) without
     false matches; correction (n, 2) of the clean ones; false (n,) bool.
@@ -79,7 +79,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Scene:
-    """A case as drawn with a seed."""
+    """A case drawn with a seed."""
 
     case: object
     cameras: tuple
@@ -93,7 +93,7 @@ class Scene:
     test_angles: list
 
     def frames(self):
-        """Frames for the calibration, by fluoroscope."""
+        """Return the frames for the calibration, by fluoroscope."""
         out = {name: [] for name in NAMES}
         for image in self.images:
             behind = self.case.behind if image.camera else 0
@@ -115,7 +115,7 @@ def draw(case, seed, recording=0, change=None):
     """Draw the scene of a case.
 
     Other recordings have the same rig, phantom and survey; change is a part of the distortion that
-    is new in this one.
+    is present only in this one.
     """
     rng = np.random.default_rng([seed, *case.name.encode()])
     true_mm = case.phantom(rng)
@@ -164,7 +164,7 @@ def draw(case, seed, recording=0, change=None):
 
 
 def _angles(case, rng, count):
-    """Angles [rad] of the C-arm in exposures, None where it does not turn."""
+    """Draw the C-arm angles [rad] of the exposures; None if it does not rotate."""
     if not case.arm:
         return [None] * count
     return [float(angle) for angle in rng.uniform(-ARM, ARM, count)]
@@ -182,7 +182,7 @@ def _camera(case, rng, f):
     middle = (side - 1) / 2 + np.asarray(case.principal) * side / 1024 + rng.normal(0, 6, 2)
     interior = np.append(middle, case.c * side * rng.uniform(0.97, 1.03))
     if np.any(case.principal):
-        # The image shows the phantom all the same: the axis of the image goes past it.
+        # Turn the camera so that the image still shows the phantom, off the axis of the image.
         offset = np.append(np.asarray(case.principal) * side / 1024 / interior[2], 0)
         tilt = Rotation.from_rotvec([-offset[1], offset[0], 0]).as_matrix() @ tilt
     distortion = Distortion.of(case.parts, rng, side)
@@ -191,7 +191,7 @@ def _camera(case, rng, f):
 
 
 def _moved(case, rng, pose):
-    """Pose in which b sees the phantom."""
+    """Return the pose in which b sees the phantom."""
     if not any(case.late):
         return pose
     turn, shift = pose
@@ -201,7 +201,7 @@ def _moved(case, rng, pose):
 
 
 def _again(case, rng, image, number):
-    """Another frame of the pose of an image, with mostly the same noise."""
+    """Return another frame of the pose of an image, with mostly the same noise."""
     fresh = FRESH_NOISE * rng.normal(0, case.noise.sd, image.observed.shape)
     return replace(
         image, number=number, observed=image.observed + fresh, clean=image.clean + fresh
@@ -217,7 +217,7 @@ def _changed(camera, change, rng):
 
 
 def _pose(case, rng, cameras, true_mm, number):
-    """Draw a pose in which both fluoroscopes see a fair part of the phantom."""
+    """Draw a pose in which both fluoroscopes see a sufficient part of the phantom."""
     for _ in range(MAX_TRIES):
         shift = rng.uniform(-case.spread, case.spread, 3)
         if case.poses == 'narrow':
@@ -244,7 +244,7 @@ def _on_image(case, uv):
 def _image(case, rng, f, camera, true_mm, pose, number):
     distortion = camera.distortion
     if case.wander:
-        # The field of this exposure; the nominal one is the mean over all exposures.
+        # The field of this exposure; the nominal field is the mean over all exposures.
         change = Distortion.of((Wander(case.wander),), rng, case.side)
         distortion = Distortion(
             distortion.parts + change.parts, distortion.drawn + change.drawn, case.side

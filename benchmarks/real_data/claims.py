@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What residuals of unseen exposures are expected to be, by the covariances of a calibration.
+"""Expected residuals of unseen exposures, from the covariances of a calibration.
 
-Redundancy numbers tell how much of independent errors is left in residuals. Errors of a correction
-are much alike in neighbouring pixels and in all exposures, and what the distortion of an exposure
-differs is alike within it: poses and targets of the tested exposures absorb more of them. The
-expected square sum is tr(R C R^T), where C is the covariance of all errors and R = I - A N^-1 A^T
-W makes residuals of them, plus what the errors of the survey contribute (Foerstner and Wrobel,
-"Photogrammetric Computer Vision", Springer 2016, 4.2).
+Redundancy numbers give the fraction of independent errors that remains in residuals. Errors of a
+correction are strongly correlated between neighbouring pixels and between exposures; deviations of
+the distortion of an exposure are correlated within it. Poses and targets of the tested exposures
+therefore absorb more of them. The expected square sum is tr(R C R^T), where C is the covariance of
+all errors and R = I - A N^-1 A^T W maps them to residuals, plus the contribution of survey errors
+(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.2).
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from fluoro_calib_ros.photogrammetry.collinearity import (
     project_with_jacobian,
 )
 
-JITTER = 1e-14  # px^2, keeps covariances positive definite
+JITTER = 1e-14  # px^2; keeps covariances positive definite
 EXTERIOR = 6
 
 
 def expected_square(
     run: SelfCalibration, tested: SolvedNetwork, claimed: np.ndarray, counted: np.ndarray
 ) -> float:
-    """Expected square sum [px^2] of the residuals of tested exposures.
+    """Return the expected square sum [px^2] of the residuals of tested exposures.
 
-    run: by collocation, of one camera. tested: the adjustment of the tested exposures. claimed
-    (N,): standard deviations [px] that the calibration claims for their image points. counted
-    (N,): whether a residual is in the sum; outliers do not touch the adjustment.
+    run: collocation of one camera. tested: the adjustment of the tested exposures. claimed (N,):
+    standard deviations [px] that the calibration claims for their image points. counted (N,):
+    whether a residual is in the sum; outliers do not affect the adjustment.
     """
     rows = np.flatnonzero(tested.adjustment.inliers)
     to_residuals, by_survey, by_interior = _to_residuals(tested, rows)
@@ -64,10 +64,10 @@ def expected_square(
 def _to_residuals(
     tested: SolvedNetwork, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What makes residuals of errors of the image points in rows (n,), and of the survey.
+    """Return the maps from errors of the image points in rows (n,) and of the survey to residuals.
 
-    Returns R (2n, 2n), a factor (2n, p) of the covariance by the survey [px], and the derivatives
-    (2n, 3) by the interior orientation.
+    The result is R (2n, 2n), a factor (2n, p) of the covariance due to the survey [px], and the
+    derivatives (2n, 3) with respect to the interior orientation.
     """
     network = tested.measured.network
     adjustment = tested.adjustment
@@ -95,9 +95,9 @@ def _to_residuals(
 
 
 def _common_errors(run: SelfCalibration, uv: np.ndarray, by_interior: np.ndarray) -> np.ndarray:
-    """Factor (2n, 3 + p) of the covariance of interior orientation and series at pixels uv.
+    """Return a factor (2n, 3 + p) of the covariance of interior orientation and series at uv.
 
-    Columns from the fourth on are those of the series, with the interior orientation known.
+    Columns from the fourth on belong to the series given the interior orientation.
     """
     layout = run.measured.network.layout
     functions = _functions(run)
@@ -115,7 +115,7 @@ def _common_errors(run: SelfCalibration, uv: np.ndarray, by_interior: np.ndarray
 
 
 def _functions(run: SelfCalibration) -> Functions:
-    """The functions of the series, as they are in the adjustment."""
+    """Return the functions of the series as used in the adjustment."""
     model = run.models[run.measured.fluoroscopes[0]]
     if model.series is None:
         raise ValueError('the model is not collocation')
@@ -124,7 +124,7 @@ def _functions(run: SelfCalibration) -> Functions:
 
 
 def _additional(run: SelfCalibration) -> AdditionalParameters:
-    """The terms of the camera."""
+    """Return the additional parameters of the camera."""
     additional = run.measured.network.additional[0]
     if additional is None:
         raise ValueError('the model is not collocation')
@@ -134,10 +134,10 @@ def _additional(run: SelfCalibration) -> AdditionalParameters:
 def _variation(
     run: SelfCalibration, tested: SolvedNetwork, rows: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Factor (2n, q) of the covariance of what tested exposures differ, and its size.
+    """Return a covariance factor (2n, q) of variations between tested exposures, and its size.
 
-    It has the variances of the terms of the exposures; the size is the mean square [px^2] that
-    poses leave of it.
+    The covariance uses the variances of the terms of the exposures; the size is the mean square
+    [px^2] that the poses do not absorb.
     """
     additional = _additional(run)
     count = 2 * len(_functions(run))

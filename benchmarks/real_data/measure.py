@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrate a part of the exposures of a set, and test with the others."""
+"""Calibrate with a part of the exposures of a set, and test with the others."""
 
 from __future__ import annotations
 
@@ -47,33 +47,33 @@ class Fold:
     training, tested : int
         Exposures.
     inside, outside : int
-        Image points of the tested exposures in the hull of the calibrated area, and beyond it.
+        Image points of the tested exposures inside and outside the hull of the calibrated area.
     false : int
-        Image points that no camera explains; they are not counted elsewhere.
+        Image points that no camera model explains; they are not counted elsewhere.
     rms_inside, rms_outside, rms : dict of str to float
         RMS of a coordinate of the residuals [px] by camera, targets estimated.
     rms_held : dict of str to float
-        The same inside with the survey held.
+        The same inside, with the survey fixed.
     nse : float
-        Of an adjustment of the tested exposures with the calibration held: square sum of the
-        residuals inside over their claimed variance, by degree of freedom, without the rejected.
+        From an adjustment of the tested exposures with fixed calibration: square sum of the
+        residuals inside over their claimed variance, per degree of freedom, without outliers.
     nse_thirds : list of float
         NSE of the third of these image points that is nearest to the middle of the image, of the
         next, and of the third at the rim.
     nse_correlated : float
         The same over its expectation by the covariances of the calibration (see `claims`).
     rejected : float
-        Share of the image points inside that the adjustment takes as gross errors.
+        Fraction of the image points inside that the adjustment classifies as gross errors.
     seconds : float
         CPU time of the calibration.
     model : str
     noise_px : float
         Claimed standard deviation of an image coordinate.
     doubts : list of str
-        Why the input was refused; it was calibrated by force.
+        Reasons for refusing the input, which was then calibrated with `force`.
     warnings : list of str
     error : str
-        Why there is no calibration.
+        Reason if there is no calibration.
     verdict : str
     findings : list of str
     """
@@ -102,7 +102,7 @@ class Fold:
 
 
 def splits(frames: Sequence[Frame], seed: int = 1) -> list[tuple[list[Frame], list[Frame]]]:
-    """Two random halves, each for training and for testing, with at least three for training."""
+    """Use each of two random halves for training and for testing; train with at least three."""
     order = np.random.default_rng(seed).permutation(len(frames))
     half = max((len(frames) + 1) // 2, MIN_TRAINING)
     parts = (order[:half], order[len(frames) - half :])
@@ -116,7 +116,7 @@ def splits(frames: Sequence[Frame], seed: int = 1) -> list[tuple[list[Frame], li
 
 
 def _calibrated(data: DataSet, training: Sequence[Frame], fold: Fold) -> fc.CalibrationOutcome:
-    """Calibrate, by force where the input is refused; fills the fold."""
+    """Calibrate, with `force` if the input is refused, and fill in the fold."""
     before = time.process_time()
     request = fc.CalibrationRequest(
         {CAMERA: training},
@@ -135,7 +135,7 @@ def _calibrated(data: DataSet, training: Sequence[Frame], fold: Fold) -> fc.Cali
 
 
 def _starts(data: DataSet, frames: Sequence[Frame], camera: OpenCVCamera) -> dict[int, np.ndarray]:
-    """Approximate poses (6,) of frames by their number."""
+    """Return approximate poses (6,) of frames by their number."""
     out = {}
     for frame in frames:
         xyz = data.phantom.xyz_mm[data.phantom.index(frame.target_id)]
@@ -145,7 +145,7 @@ def _starts(data: DataSet, frames: Sequence[Frame], camera: OpenCVCamera) -> dic
 
 
 def _pixels(frames: Sequence[Frame]) -> np.ndarray:
-    """Image points and their neighbours, whose directions are asked for."""
+    """Return the image points and their neighbours, whose directions are needed."""
     steps = np.array([[0, 0], [STEP_PX, 0], [-STEP_PX, 0], [0, STEP_PX], [0, -STEP_PX]])
     return np.concatenate([frame.uv + step for frame in frames for step in steps])
 
@@ -159,7 +159,7 @@ def measure_fold(
 ) -> Fold:
     """Calibrate with some exposures and test with others.
 
-    mrcal: interpreter with mrcal, None: it is left out. validated: whether there is a verdict.
+    mrcal: interpreter with mrcal, None to omit it. validated: whether to compute a verdict.
     """
     fold = Fold(len(training), len(tested))
     with warnings.catch_warnings(record=True) as caught:
@@ -168,7 +168,7 @@ def measure_fold(
             outcome = _calibrated(data, training, fold)
         except fc.DataError as error:
             fold.error = str(error)
-        except Exception:  # what must not happen is reported
+        except Exception:  # unexpected errors are reported, too
             fold.error = 'traceback: ' + traceback.format_exc().splitlines()[-1]
         else:
             _measure(data, training, tested, outcome, mrcal, fold)
@@ -234,10 +234,10 @@ def _test_claims(
     inside: np.ndarray,
     fold: Fold,
 ) -> None:
-    """Fill in what an adjustment of the tested exposures with the calibration held says.
+    """Fill in the results of an adjustment of the tested exposures with fixed calibration.
 
-    inside (N, 2): image points, in the order of the frames, in the hull of the calibrated area,
-    and those of them that some camera explains.
+    inside (N, 2): whether image points, in the order of the frames, are in the hull of the
+    calibrated area, and whether some camera also explains them.
     """
     adjusted = fc.adjust({CAMERA: tested}, data.phantom, outcome.calibrations)
     table = adjusted.residuals
@@ -248,7 +248,7 @@ def _test_claims(
         [counts[key] for key in zip(table.exposure.tolist(), table.target_id.tolist())]
     ).T
     fold.rejected = float(np.mean(table.outlier[explained]))
-    # What no camera explains and the adjustment keeps is in the claim, too.
+    # The claim includes points that no camera explains if the adjustment keeps them.
     kept &= ~table.outlier
     claimed = outcome.calibrations[CAMERA].correct(table.uv[kept], exact=True).sigma
     squares = np.sum(table.residual[kept] ** 2, axis=1) / claimed**2

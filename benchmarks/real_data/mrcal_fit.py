@@ -12,12 +12,12 @@ from typing import Any
 import mrcal
 import numpy as np
 
-METRE = 1e-3  # mrcal's ranges are in metres
+METRE = 1e-3  # mrcal's unit of length is the metre
 RANGE_M = (1e-4, 1e4)
 
 
 def fit(task: dict[str, Any], model: str, start: np.ndarray) -> np.ndarray:
-    """Intrinsics of a lens model; the targets are held at their survey."""
+    """Return the intrinsics of a lens model, with the targets fixed to their survey."""
     intrinsics = start[None].copy()
     exposures = len(task['poses'])
     poses = task['poses'].copy()
@@ -56,13 +56,13 @@ def fit(task: dict[str, Any], model: str, start: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    """Read the task, write the directions x/z, y/z of its pixels by each model."""
+    """Read the task, and write the directions x/z, y/z of its pixels for each model."""
     path = Path(sys.argv[1])
     with np.load(path) as file:
         task = dict(file)
     matrix = task['matrix']
     core = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-    # Poses by OpenCV fit its own distortion, with which the refinement of all begins.
+    # OpenCV's poses fit its own distortion model, so refinement of all models starts with it.
     rays = {}
     for name, model in zip(task['names'].tolist(), task['models'].tolist()):
         size = mrcal.lensmodel_num_params(model)

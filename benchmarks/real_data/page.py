@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page docs/how_good/real_data.md."""
+"""Generate the page docs/how_good/real_data.md."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from .sources import text_of_sources
 WIDTH = 120
 REFERENCE = 'OpenCV Brown'
 MAX_NSE = 1.5
-HONEST = (0.8, 1.25)  # range of an NSE
-SENTENCE = 450  # characters of a finding that are shown
+HONEST = (0.8, 1.25)  # range of an honest NSE
+SENTENCE = 450  # maximum number of characters of a displayed finding
 
 Result = dict[str, Any]
 
@@ -126,7 +126,7 @@ to OpenCV with Brown's model.
 
 
 def _rms(result: Result, table: str, camera: str, weight: str) -> float:
-    """RMS [px] over the splits of a set, weighted with their numbers of image points."""
+    """Return the RMS [px] over the splits of a set, weighted by their numbers of image points."""
     square = 0.0
     count = 0
     for fold in result['folds']:
@@ -154,7 +154,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) ->
 
 
 def _cameras(results: Sequence[Result]) -> list[str]:
-    """Names of all cameras, in their order."""
+    """Return the names of all cameras in order of appearance."""
     names: dict[str, None] = {}
     for result in results:
         for fold in result['folds']:
@@ -163,7 +163,7 @@ def _cameras(results: Sequence[Result]) -> list[str]:
 
 
 def _ratio(results: Sequence[Result], table: str, camera: str, weight: str) -> float:
-    """Geometric mean over the sets of the RMS over that of the reference."""
+    """Return the geometric mean over the sets of the RMS relative to the reference."""
     ratios = [
         _rms(one, table, camera, weight) / _rms(one, table, REFERENCE, weight) for one in results
     ]
@@ -233,12 +233,12 @@ def _claims(results: Sequence[Result]) -> str:
 
 
 def _halves(result: Result, figure: str) -> str:
-    """A figure of both splits."""
+    """Return a figure for both splits."""
     return ', '.join(_cell(fold.get(figure, float('nan')), 2) for fold in result['folds'])
 
 
 def _thirds(result: Result) -> str:
-    """NSE in the middle, about it and at the border, geometric means of both splits."""
+    """Return NSE in the middle, around it and at the border, as geometric means of the splits."""
     values = [fold['nse_thirds'] for fold in result['folds'] if fold.get('nse_thirds')]
     if not values:
         return '-'
@@ -246,13 +246,13 @@ def _thirds(result: Result) -> str:
 
 
 def _geometric_mean(result: Result, figure: str) -> float:
-    """Geometric mean of a figure over the splits of a set."""
+    """Return the geometric mean of a figure over the splits of a set."""
     values = [fold.get(figure, float('nan')) for fold in result['folds']]
     return float(np.exp(np.mean(np.log(values))))
 
 
 def _spread(values: Sequence[float]) -> str:
-    """Median of NSEs and how many are as they should be."""
+    """Return the median of NSEs, and how many lie within limits."""
     within = sum(HONEST[0] <= value <= HONEST[1] for value in values)
     above = sum(value > MAX_NSE for value in values)
     return (
@@ -262,7 +262,7 @@ def _spread(values: Sequence[float]) -> str:
 
 
 def _words(results: Sequence[Result]) -> str:
-    """What calibrations and verdicts said."""
+    """Return messages of calibrations and verdicts."""
     lines = []
     for one in results:
         first = one['folds'][0]
@@ -279,7 +279,7 @@ def _words(results: Sequence[Result]) -> str:
 
 
 def _summary(results: Sequence[Result], note: str) -> str:
-    """Return the figures that matter first, after a note."""
+    """Return the most important figures, after a note."""
     cameras = _cameras(results)
 
     def best(table: str, weight: str) -> str:

@@ -38,16 +38,16 @@ FOV_MARGIN = 1.15
 
 
 def _points(frame: Frame, phantom: Phantom) -> np.ndarray:
-    """Surveyed coordinates (n, 3) [mm] of the targets of a frame."""
+    """Return surveyed coordinates (n, 3) [mm] of the targets of a frame."""
     return phantom.xyz_mm[phantom.index(frame.target_id)]
 
 
 def calibrate_with_opencv(
     frames: Sequence[Frame], phantom: Phantom, interior: np.ndarray, flags: int
 ) -> tuple[OpenCVCamera, list[np.ndarray]]:
-    """Camera by cv2.calibrateCamera, and the poses (6,) of the frames.
+    """Return the camera by cv2.calibrateCamera, and the poses (6,) of the frames.
 
-    interior (3,) [px]: start values, which OpenCV needs for targets in space.
+    interior (3,) [px]: initial values, which OpenCV requires for non-planar targets.
     """
     xp, yp, c = interior
     matrix = np.array([[c, 0, xp], [0, c, yp], [0, 0, 1.0]])
@@ -71,9 +71,9 @@ def calibrate_with_mrcal(
     start: tuple[OpenCVCamera, list[np.ndarray]],
     pixels: np.ndarray,
 ) -> dict[str, RayCamera]:
-    """Cameras by mrcal, which runs in an interpreter of its own.
+    """Return cameras by mrcal, which runs in a separate interpreter.
 
-    start: camera and poses by OpenCV. pixels (n, 2): those whose directions will be asked for.
+    start: camera and poses by OpenCV. pixels (n, 2): pixels whose directions will be needed.
     """
     camera, poses = start
     size = frames[0].image_size
@@ -97,7 +97,7 @@ def calibrate_with_mrcal(
             names=list(names),
             models=list(names.values()),
         )
-        # It has its own packages.
+        # The interpreter has its own packages.
         environment = {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}
         done = subprocess.run(
             [python, str(MRCAL_SCRIPT), str(path)],

@@ -1,14 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Residuals of unseen exposures: poses are estimated, and targets within their survey.
+"""Residuals of unseen exposures with estimated poses, and targets estimated within their survey.
 
-The camera is held, and all cameras are treated alike. The pose is that of the targets with the
-least robust sum of residuals (scipy's soft L1, scale one pixel), which are in observed pixels:
-those of a camera that corrects pixels are divided by the derivative of the correction. Surveys
-have errors of their own, and a camera that was calibrated with held targets has learned some of
-them. Targets are therefore also estimated, in turn with the poses, with their surveyed coordinates
-as observations.
+The camera is fixed, and all cameras are treated alike. The pose of the targets minimises a robust
+sum of residuals (scipy's soft L1, scale one pixel) in observed pixels: residuals of a camera that
+corrects pixels are divided by the derivative of the correction. Surveys have errors, and a camera
+that was calibrated with fixed targets has learned some of them. Targets are therefore also
+estimated, alternating with the poses, with their surveyed coordinates as observations.
 """
 
 from __future__ import annotations
@@ -27,17 +26,17 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalib
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 
-STEP_PX = 0.5  # of the derivative of a correction
+STEP_PX = 0.5  # step for the derivative of a correction
 FAR_PX = 1e4
-ROUNDS = 8  # of poses and targets in turn
-NU = 10.0  # degrees of freedom of the weights of rays that move a target
+ROUNDS = 8  # alternations between poses and targets
+NU = 10.0  # degrees of freedom in the weights of rays that move a target
 MEDIAN_OF_NORM = 1.18  # median length of a vector of two standard normal variables
 MIN_SD_PX = 1e-3
-# An image point is a false match if it is this many robust standard deviations off for every
+# An image point is a false match if it deviates by this many robust standard deviations for every
 # camera.
 GROSS = 8.0
 GROSS_PX = 1.0
-# A calibration has failed if its typical residual is so many times that of the best camera.
+# A calibration has failed if its typical residual is this many times that of the best camera.
 FAILED = 30.0
 
 
@@ -46,7 +45,7 @@ Residuals = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class Camera(Protocol):
-    """What is scored."""
+    """Interface of a scored camera."""
 
     def residuals(self, frame: Frame) -> Residuals:
         """Return the residuals of a frame as a function of pose and targets."""
@@ -54,12 +53,12 @@ class Camera(Protocol):
 
 @dataclass(frozen=True)
 class RayCamera:
-    """A camera by the directions x/z, y/z of pixels (n, 2)."""
+    """A camera defined by the directions x/z, y/z of pixels (n, 2)."""
 
     rays: Callable[[np.ndarray], np.ndarray]
 
     def residuals(self, frame: Frame) -> Residuals:
-        """See `Camera`."""
+        """Return the residuals of a frame; see `Camera`."""
         ray = self.rays(frame.uv)
         steps = STEP_PX * np.eye(2)
         derivative = np.stack(
@@ -80,13 +79,13 @@ class RayCamera:
 
 @dataclass(frozen=True)
 class OpenCVCamera:
-    """A camera of OpenCV: matrix (3, 3) and distortion coefficients."""
+    """An OpenCV camera: matrix (3, 3) and distortion coefficients."""
 
     matrix: np.ndarray
     distortion: np.ndarray
 
     def residuals(self, frame: Frame) -> Residuals:
-        """See `Camera`."""
+        """Return the residuals of a frame; see `Camera`."""
 
         def of_pose(pose: np.ndarray, xyz: np.ndarray) -> np.ndarray:
             uv, _ = cv2.projectPoints(xyz, pose[:3], pose[3:], self.matrix, self.distortion)
@@ -111,7 +110,7 @@ def unseen_residuals(
     phantom: Phantom,
     start: Mapping[int, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (N, 2) [px] of frames with the survey held, and with the targets estimated.
+    """Return residuals (N, 2) [px] of frames with fixed survey, and with estimated targets.
 
     start: approximate poses (6,) by frame number.
     """
@@ -136,7 +135,7 @@ def unseen_residuals(
 
 
 def _pose(of_frame: Residuals, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Pose (6,) of an exposure with targets (n, 3)."""
+    """Estimate the pose (6,) of an exposure with targets (n, 3)."""
     size = float(np.linalg.norm(start[3:]))
     scale = np.array([1, 1, 1, size, size, size])
 
@@ -157,7 +156,7 @@ def _move_targets(
     rows: Sequence[np.ndarray],
     poses: Sequence[np.ndarray],
 ) -> None:
-    """Move targets (n, 3) by one robust Gauss-Newton step, poses held."""
+    """Move targets (n, 3) by one robust Gauss-Newton step with fixed poses."""
     normal = np.zeros((len(xyz), 3, 3))
     right = np.zeros((len(xyz), 3))
     parts = []
@@ -186,20 +185,20 @@ def _move_targets(
 
 
 def inside_hull(training: Sequence[Frame], uv: np.ndarray) -> np.ndarray:
-    """Whether pixels (n, 2) are in the convex hull of the image points of exposures."""
+    """Return whether pixels (n, 2) are in the convex hull of the image points of exposures."""
     hull = ConvexHull(np.concatenate([frame.uv for frame in training]))
     return (uv @ hull.equations[:, :2].T + hull.equations[:, 2] <= 1e-9).all(axis=1)
 
 
 def solved(residuals: Mapping[str, np.ndarray]) -> list[str]:
-    """Names of the cameras whose calibration has not failed, from residuals (n, 2) by camera."""
+    """Return the cameras whose calibration has not failed, from residuals (n, 2) by camera."""
     size = {name: float(np.median(np.linalg.norm(r, axis=1))) for name, r in residuals.items()}
     best = min(value for value in size.values() if np.isfinite(value))
     return [name for name, value in size.items() if value <= FAILED * best]
 
 
 def false_matches(residuals: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Image points (n,) that no camera explains, from residuals (n, 2) by camera."""
+    """Return image points (n,) that no camera explains, from residuals (n, 2) by camera."""
     out = np.ones(len(next(iter(residuals.values()))), dtype=bool)
     for r in residuals.values():
         size = np.linalg.norm(r, axis=1)
@@ -208,5 +207,5 @@ def false_matches(residuals: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def rms(residuals: np.ndarray) -> float:
-    """RMS of a coordinate of residuals (n, 2), NaN without any."""
+    """Return the RMS of a coordinate of residuals (n, 2), NaN if there are none."""
     return float(np.sqrt(np.mean(residuals**2))) if len(residuals) else float('nan')

@@ -19,16 +19,16 @@ from .sources import CUBE_TEST, CUBE_TRAIN, OPENCV_NUMBERS, PLANE_TEST, PLANE_TR
 
 CAMERA = 'camera'
 MIN_SURVEY_SD_MM = 1e-3
-MIN_TARGETS = 12  # of an exposure that is calibrated with, or tested
+MIN_TARGETS = 12  # in an exposure for calibration or test
 IDS_OF_BOARD = 1000
-BOARD_SD_MM = 0.1  # of boards whose accuracy is not stated
+BOARD_SD_MM = 0.1  # for boards of unstated accuracy
 INCH_MM = 25.4
 ORPC_HEADER = 5
-FISHEYE_RADIUS_PX = 280.0  # some 35 degrees off the axis
+FISHEYE_RADIUS_PX = 280.0  # about 35 degrees off the axis
 FISHEYE_PX = 380.0
-AICON_STEP = 3  # every third of 115 exposures
+AICON_STEP = 3  # use every third of 115 exposures
 CHESSBOARD = (9, 6)
-SQUARE_MM = 25.0  # its true size is not published and only scales the board
+SQUARE_MM = 25.0  # the true size is not published and only scales the board
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class DataSet:
         Exposures with 12 targets or more, in the order of their numbers.
     phantom : Phantom
     principal_distance : float or None
-        Start value [px] of a lens whose distortion hides it.
+        Initial value [px] for a lens whose distortion obscures it.
     """
 
     name: str
@@ -65,7 +65,7 @@ class DataSet:
 def _data_set(
     name: str, title: str, solid: bool, frames: list[Frame], phantom: Phantom
 ) -> DataSet:
-    """A set without points off the image or without survey, and exposures that show too little."""
+    """Return a set without outside or unsurveyed points and exposures with too few targets."""
     kept = []
     for frame in frames:
         good = points_on_image(frame.uv, frame.image_size)
@@ -80,7 +80,7 @@ def _data_set(
 
 
 def _numbers(line: str) -> list[float]:
-    """Numbers of a line, an empty list where it holds something else."""
+    """Return the numbers of a line, or an empty list if it contains anything else."""
     try:
         return [float(word) for word in line.split()]
     except ValueError:
@@ -88,7 +88,7 @@ def _numbers(line: str) -> list[float]:
 
 
 def _blocks(lines: Iterator[str]) -> Iterator[np.ndarray]:
-    """Blocks of lines of numbers, separated by empty lines; arrays of their rows."""
+    """Yield blocks of lines of numbers, separated by empty lines, as arrays of their rows."""
     block: list[list[float]] = []
     for line in lines:
         row = _numbers(line)
@@ -102,8 +102,8 @@ def _blocks(lines: Iterator[str]) -> Iterator[np.ndarray]:
 def photomodeler(path: Path, name: str, title: str, solid: bool, unit_mm: float) -> DataSet:
     """Read a text export of PhotoModeler.
 
-    Its blocks are separated by empty lines: one for each photograph, control points, object points
-    (id, coordinates and standard deviations), image points (photograph, id, column and row).
+    Blocks are separated by empty lines: one block for each photograph, then control points, object
+    points (id, coordinates, standard deviations), and image points (photograph, id, column, row).
     Pixel centres are at 0.5.
     """
     lines = path.read_text(encoding='latin-1').splitlines()
@@ -111,11 +111,12 @@ def photomodeler(path: Path, name: str, title: str, solid: bool, unit_mm: float)
     last = max(i for i, line in enumerate(lines) if '\\' in line)  # path of the last photograph
     end = next(i for i in range(last, len(lines)) if not lines[i].strip())
     rest = lines[end + 1 :]
-    # The interior orientation of the photograph follows the empty line, then one more.
+    # The interior orientation of the photograph follows the empty line, then comes another empty
+    # line.
     start = next(i for i, line in enumerate(rest) if not line.strip())
     _, points, marks, *_ = _blocks(iter(rest[start + 1 :]))
     _, row, times = np.unique(points[:, 0], return_index=True, return_counts=True)
-    points = points[row[times == 1]]  # an id with two places is none
+    points = points[row[times == 1]]  # an id with two positions is invalid
     phantom = Phantom(
         points[:, 0].astype(int),
         unit_mm * points[:, 1:4],
@@ -130,11 +131,11 @@ def photomodeler(path: Path, name: str, title: str, solid: bool, unit_mm: float)
 
 
 def _boards(path: Path) -> list[np.ndarray]:
-    """Points (n, 3) [cm] of every board of a target description of BabelCalib."""
+    """Return points (n, 3) [cm] of every board in a target description of BabelCalib."""
     boards: list[list[list[float]]] = []
     for line in path.read_text().splitlines():
         words = line.split(',')
-        if len(words) == 2:  # the family of tags, second line of a board
+        if len(words) == 2:  # second line of a board: the family of tags
             boards.append([])
         elif len(words) == 6:
             boards[-1].append([float(word) for word in words[3:]])
@@ -142,7 +143,7 @@ def _boards(path: Path) -> list[np.ndarray]:
 
 
 def _poses(path: Path) -> dict[int, np.ndarray]:
-    """Pose (3, 4) [mm] of boards by their index, from a file of BabelCalib."""
+    """Return poses (3, 4) [mm] of boards by index, from a file of BabelCalib."""
     lines = [line for line in path.read_text().splitlines() if not line.startswith('#')]
     return {
         int(lines[i]): np.array([_numbers(line) for line in lines[i + 1 : i + 4]])
@@ -151,14 +152,14 @@ def _poses(path: Path) -> dict[int, np.ndarray]:
 
 
 def _central(frame: Frame) -> Frame:
-    """The middle of a frame of a fisheye lens: its rim, 60 degrees off the axis, is no plane."""
+    """Return the middle of a fisheye frame: its rim, 60 degrees off the axis, maps to no plane."""
     middle = (np.array(frame.image_size) - 1) / 2
     near = np.linalg.norm(frame.uv - middle, axis=1) <= FISHEYE_RADIUS_PX
     return replace(frame, target_id=frame.target_id[near], uv=frame.uv[near])
 
 
 def _corner_files(paths: list[Path], used: set[int]) -> list[Frame]:
-    """Frames of corner files of BabelCalib, of the boards that are used."""
+    """Return frames from corner files of BabelCalib for the boards in use."""
     frames = []
     for number, path in enumerate(paths, 1):
         lines = path.read_text().splitlines()
@@ -172,7 +173,7 @@ def _corner_files(paths: list[Path], used: set[int]) -> list[Frame]:
 
 
 def babelcalib_cube(folder: Path) -> DataSet:
-    """Read three boards in space."""
+    """Read three non-coplanar boards."""
     base = folder / 'ylochman/babelcalib/data/ov_cube'
     poses = _poses(base / 'ov_cube.tp')
     ids = []
@@ -206,7 +207,7 @@ def babelcalib_plane(folder: Path) -> DataSet:
 
 
 def chessboards(folder: Path, side: str) -> DataSet:
-    """Find the corners of the sample images of OpenCV."""
+    """Detect the corners in the sample images of OpenCV."""
     columns, rows = CHESSBOARD
     grid = np.array([[x, y, 0] for y in range(rows) for x in range(columns)]) * SQUARE_MM
     phantom = Phantom(np.arange(len(grid)), grid, np.full(len(grid), BOARD_SD_MM))
@@ -226,7 +227,7 @@ def chessboards(folder: Path, side: str) -> DataSet:
 
 
 def zhang(folder: Path) -> DataSet:
-    """Read the views of Zhang: the corners of 64 squares, in inches."""
+    """Read the views of Zhang: corners of 64 squares, in inches."""
     base = folder / 'imagingbook/imagingbook-calibrate' / ZHANG
     flat = np.array((base / 'Model.txt').read_text().split(), dtype=float).reshape(-1, 2)
     xyz = np.column_stack([flat, np.zeros(len(flat))]) * INCH_MM
@@ -240,7 +241,7 @@ def zhang(folder: Path) -> DataSet:
 
 
 def aicon(folder: Path) -> DataSet:
-    """Read files of AICON: image points in mm from the middle of the image, y up."""
+    """Read AICON files: image points in mm from the middle of the image, y up."""
     base = folder / 'applied-geodesy/bundle-adjustment/JAICOV/example'
     last = (base / 'example.ior').read_text().split()[-4:]
     sensor = np.array([float(last[0]), float(last[1])])
@@ -270,8 +271,7 @@ def _photomodeler_of(
     )
 
 
-# In the repository, the names of the networks 2 and 3 are interchanged: their photographs tell the
-# cameras.
+# In the repository, the names of networks 2 and 3 are interchanged, as their photographs show.
 READERS: dict[str, Callable[[Path], DataSet]] = {
     'camcal': _photomodeler_of(
         'camcal', 'Olympus C4040Z, sheet', f'{PM}/net1-C404Z-2d.txt', False
@@ -290,7 +290,7 @@ READERS: dict[str, Callable[[Path], DataSet]] = {
         'canon7d_3d', 'Canon 7D, test field', f'{PM}/net4-canon7d-3d.txt', True
     ),
     'canon5d_3d': _photomodeler_of(
-        # Its unit is not stated; this one makes a facade of some ten metres.
+        # The unit is not stated; this one makes a facade of about ten metres.
         'canon5d_3d',
         'Canon 5D, facade, by hand',
         f'{PM}/net5-canon5d-3d.txt',

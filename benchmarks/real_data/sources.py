@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where the data come from, under which licence, and their download.
+"""Sources of the data, their licences, and the download.
 
-Nothing of the data is part of this project. A file is kept below the folder of the data as
+The data are not part of this project. A file is stored below the data folder as
 OWNER/REPOSITORY/PATH.
 """
 
@@ -18,7 +18,7 @@ from textwrap import fill
 
 RAW = 'https://raw.githubusercontent.com'
 TIMEOUT = 60.0  # s
-WIDTH = 120  # of lines of the list
+WIDTH = 120  # line width of the list
 
 PM = 'data/riva2014/pmexports'
 ZHANG = (
@@ -52,7 +52,7 @@ class Source:
     licence : str
         Licence that the repository states.
     about : str
-        What the data are, and whose.
+        Description of the data, and their authors.
     paths : tuple of str
     """
 
@@ -63,7 +63,7 @@ class Source:
     paths: tuple[str, ...]
 
     def addresses(self) -> dict[str, str]:
-        """Address of every file by its path below the folder of the data."""
+        """Address of every file, by its path below the data folder."""
         return {
             f'{self.repository}/{path}': f'{RAW}/{self.repository}/{self.commit}/{path}'
             for path in self.paths
@@ -138,7 +138,7 @@ SOURCES = (
 
 
 def download(folder: Path, sources: Sequence[Source] = SOURCES) -> None:
-    """Fetch what is not yet in a folder."""
+    """Fetch missing files into a folder."""
     for source in sources:
         for name, address in source.addresses().items():
             target = folder / name

@@ -1,4 +1,4 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One module a reader, each with a constant TARGET."""
+"""One module per reader, each with a constant TARGET."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibration file as it is: a ZIP archive, also with compressed members."""
+"""The calibration file itself: a ZIP archive, also with compressed members."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Images in bags: raw and compressed ones, as the extraction reads them."""
+"""Images in bags, raw and compressed, as the extraction reads them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _compressed(content: bytes, name: str) -> bytes:
 
 
 def _bag(kind: str, topic: str, messages: list[bytes]) -> bytes:
-    """Return a bag of one topic without compression and checksums."""
+    """Return a bag with one topic, without compression and checksums."""
     buffer = io.BytesIO()
     writer = Writer(
         buffer, compression=CompressionType.NONE, enable_crcs=False, enable_data_crcs=False

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bag file of MCAP: read, inspected and recovered."""
+"""An MCAP bag file: read, inspected and recovered."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""metadata.yaml of a bag folder, QoS profiles in it, and the expected numbers of messages."""
+"""metadata.yaml of a bag folder, with its QoS profiles and expected message counts."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bag file of sqlite3, as rosbag2 wrote them before Jazzy."""
+"""An sqlite3 bag file, as rosbag2 wrote them before Jazzy."""
 
 from __future__ import annotations
 

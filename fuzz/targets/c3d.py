@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""C3D; the process in which ezc3d runs is forked here, which is a hundred times faster."""
+"""C3D files; the process that runs ezc3d is forked here, which is a hundred times faster."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from ..harness import Target
 from ..seeds import written
 
 SETTINGS = FileSettings()
-SECONDS = 10  # of a child
-assert ezc3d  # loaded before the forks
+SECONDS = 10  # time limit of a child
+assert ezc3d  # import it before the forks
 
 
 def run_forked(
     name: str, kind: str, path: str, timeout_s: float
 ) -> subprocess.CompletedProcess[bytes]:
-    """Do what `run_module` does with the program of the reader."""
+    """Replace `run_module`: run the program of the reader in a forked process."""
     pipes = [os.pipe(), os.pipe()]
     child = os.fork()
     if not child:
@@ -52,10 +52,10 @@ def run_forked(
 
 
 def _work(kind: str, path: str) -> NoReturn:
-    """Be the process of the reader."""
+    """Run as the process of the reader."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     for number in (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS):
-        signal.signal(number, signal.SIG_DFL)  # those of the fuzzer would report a finding
+        signal.signal(number, signal.SIG_DFL)  # the fuzzer's own handlers would report a finding
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.alarm(SECONDS)
     sys.argv = ['reader_process', kind, path]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages of calibrations and orientations; the ids are made to match what was changed."""
+"""Messages of calibrations and orientations; their ids are recomputed to match changed content."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def _read_orientation(data: bytes) -> None:
 def _decoded(kind: type, data: bytes) -> Any:
     try:
         return deserialize_message(data, kind)
-    except Exception as error:  # of rclpy: the stream readers count such messages
+    except Exception as error:  # raised by rclpy; the stream readers count such messages
         raise DataError(f'undecodable ({type(error).__name__})') from None
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibration file; the fuzzer sees its arrays without archive and checksums."""
+"""The calibration file; the fuzzer sees its arrays without the archive and its checksums."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def _read(path: Path) -> None:
 
 
 def _seed(bits: int) -> bytes:
-    """Return a recording with the fields that are read, as docs/extraction.md says."""
+    """Return a recording with the fields that are read, as described in docs/extraction.md."""
     pixels = images()[0].tobytes() if bits == 8 else images()[1].astype('<u2').tobytes()
     height, width = images()[0].shape
     count = 2

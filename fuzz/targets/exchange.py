@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text files of other programs, of every format that is recognised or written."""
+"""Text files of other programs, in every format that is recognised or written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ..harness import Target, both
 from ..seeds import frames, rig
 
 SETTINGS = FileSettings(image_size=(1024, 1024), units='mm', rate_hz=100.0)
-# These have targets of their own; C3D and SLEAP are read in another process.
+# These formats have their own targets; C3D and SLEAP are read in another process.
 OTHERS = ('observations', 'phantom', 'known_orientation', 'c3d', 'sleap', 'xmalab_project')
 KINDS = tuple(kind for kind in registry.kinds(lambda f: f.read is not None) if kind not in OTHERS)
 

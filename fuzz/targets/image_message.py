@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages of images, raw and compressed, as the nodes read them."""
+"""Image messages, raw and compressed, as the nodes read them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def _read(path: Path) -> None:
 def _decode(kind: type, data: bytes) -> None:
     try:
         message = deserialize_message(data, kind)
-    except Exception as error:  # of rclpy: the stream readers count such messages
+    except Exception as error:  # raised by rclpy; the stream readers count such messages
         raise DataError(f'undecodable ({type(error).__name__})') from None
     try:
         image, _ = ImageConverter('a').decoded(message)
     except Refused as error:
         raise DataError(str(error)) from None
-    np.sum(image)  # every pixel can be read
+    np.sum(image)  # checks that every pixel is readable
 
 
 def _seeds() -> list[bytes]:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Image files: PNG, TIFF, JPEG and others, stacks too."""
+"""Image files: PNG, TIFF, JPEG and others, including stacks."""
 
 from __future__ import annotations
 

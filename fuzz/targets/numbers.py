@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Degenerate numbers through a whole calibration: noise, survey, points on one place or line."""
+"""Degenerate numbers in a whole calibration: noise, survey, coincident or collinear points."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ VALUES = (
     *(1.7e308, -1e300, 1e-5, 1e5),
 )
 EXPOSURES = 3
-INPUT = struct.Struct('<BBB')  # field, how, value
+INPUT = struct.Struct('<BBB')  # field, kind of change, value
 
 
 @functools.cache
@@ -41,7 +41,7 @@ def _frames() -> list[Frame]:
 
 
 def _changed(values: np.ndarray, how: str, value: float) -> np.ndarray:
-    """Return numbers (n,) with the value in place of all, one or some, or multiplied by it."""
+    """Return numbers (n,) with all, one or some replaced by the value, or multiplied by it."""
     out = np.array(values, dtype=float)
     if how == 'scale':
         with np.errstate(over='ignore'):
@@ -90,7 +90,7 @@ def _read(path: Path) -> None:
 
 
 def calibrate(folder: Path, frames: Sequence[Frame], phantom: Phantom) -> None:
-    """Calibrate from files, as the command does. Raises DataError."""
+    """Calibrate from files, as the command does. Raise DataError if the input is refused."""
     write_observations_csv(folder / 'observations.csv', frames)
     write_phantom(folder / 'phantom.csv', phantom)
     read = read_observations_csv(folder / 'observations.csv', frames[0].image_size)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The orientation of a rig; the fuzzer sees its arrays without archive and checksums."""
+"""The orientation of a rig; the fuzzer sees its arrays without the archive and its checksums."""
 
 from __future__ import annotations
 

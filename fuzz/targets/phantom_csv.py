@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The phantom as CSV, moving points and names."""
+"""The phantom as CSV, including moving points and names."""
 
 from __future__ import annotations
 

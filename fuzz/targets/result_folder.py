@@ -26,7 +26,7 @@ from ..seeds import rig
 
 @functools.cache
 def _folder() -> tempfile.TemporaryDirectory[str]:
-    """Return the result folder of a small calibration; it lives as long as the process."""
+    """Return the result folder of a small calibration; it exists until the process ends."""
     temporary = tempfile.TemporaryDirectory()
     frames = {'a': simulate_exposures(rig(), 5, 1).frames['a']}
     options = CalibrationOptions(model='none', max_iterations=2)
@@ -38,7 +38,7 @@ def _folder() -> tempfile.TemporaryDirectory[str]:
 def _read(path: Path) -> None:
     folder = Path(_folder().name) / 'result'
     (folder / RESULT).write_bytes(path.read_bytes())
-    with mock.patch.object(html, '_figures', lambda *_: []):  # seconds, from other files
+    with mock.patch.object(html, '_figures', lambda *_: []):  # slow, from other files
         both(lambda: list(stations_of(folder / RESULT)), lambda: write_report(folder))
 
 

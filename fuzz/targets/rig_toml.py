@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""rig.toml, and a calibration of Anipose, which is TOML, too."""
+"""rig.toml, and calibrations of Anipose, which are also TOML."""
 
 from __future__ import annotations
 

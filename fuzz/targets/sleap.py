@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Analysis files of SLEAP; the process in which HDF5 runs is forked, as that of C3D."""
+"""Analysis files of SLEAP; the process that runs HDF5 is forked, as for C3D."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .c3d import run_forked
 
 SIZE = (64, 64)
 SETTINGS = FileSettings(image_size=SIZE)
-assert h5py  # loaded before the forks
+assert h5py  # import it before the forks
 
 
 def _read(path: Path) -> None:

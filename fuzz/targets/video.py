@@ -26,7 +26,7 @@ def _read(path: Path) -> None:
 
 
 def _video(ending: str, image: np.ndarray) -> bytes:
-    """Return a video of an image, larger than the smallest that codecs take."""
+    """Return a video of an image that is larger than the minimum size of codecs."""
     frame = np.tile(image, (4, 4))
     source = ImageSource('video', FRAMES, (('', frame) for _ in range(FRAMES)), 30.0)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The hand-written readers of stream messages against those of rclpy."""
+"""The hand-written readers of stream messages, compared with those of rclpy."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ ARRAYS = ('target_id', 'u', 'v', 'sigma', 'correction_sd', 'status')
 
 
 def _attempt(function: Any, *arguments: Any) -> Any:
-    """Return a result, or None where the bytes are refused."""
+    """Return the result of a function, or None if it refuses the bytes."""
     try:
         return function(*arguments)
-    except (ValueError, RuntimeError, MemoryError):  # as StreamReader expects them
+    except (ValueError, RuntimeError, MemoryError):  # the exceptions that StreamReader expects
         return None
     except Exception as error:
         if type(error).__name__ == 'RCLError':
@@ -36,7 +36,7 @@ def _attempt(function: Any, *arguments: Any) -> Any:
 
 
 def _agree(found: Any, expected: Any) -> None:
-    """Raise Broken where two readers give different messages."""
+    """Raise Broken if two readers return different messages."""
     pairs: dict[str, tuple[Any, Any]] = {
         'sec': (found.sec, expected.header.stamp.sec),
         'nanosec': (found.nanosec, expected.header.stamp.nanosec),

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Projects of XMALab; the fuzzer sees the files without archive and checksums."""
+"""Projects of XMALab; the fuzzer sees the files without the archive and its checksums."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _read(path: Path) -> None:
 
 
 def _camera(folder: str) -> tuple[str, dict[str, bytes]]:
-    """Return the element of a camera and its files."""
+    """Return the XML element of a camera and its files."""
     data = f'{folder}/data/'
     files = {
         f'{folder}/image.png': encoded_images('.png')[0],

@@ -30,7 +30,8 @@ from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
 )
 from fluoro_calib_ros.nodes.messages.observations import decode_joint_state
 
-# Of FluoroscopeCalibration before it had angles, and before it had a noise profile (REP-2016).
+# Type hashes (REP-2016) of FluoroscopeCalibration before it had angles, and before it had a noise
+# profile.
 EARLIER_HASHES = (
     'RIHS01_0f953840578d8b58b031c13ce41212b81930fc2fb1ab721e149235d7490eaf4a',
     'RIHS01_114db66782793eb5b2d2a006354e69009304cdc156d56be9b3abae2d333fa6a6',
@@ -55,7 +56,7 @@ def earlier_store(changes):
 
 
 def earlier_bytes(calibration, changes=0):
-    """Return a message as it was after the first changes of its definition."""
+    """Return a message as encoded after the first `changes` changes of its definition."""
     present = from_cdr(
         serialize_message(message_from_calibration(calibration)), FLUOROSCOPE_CALIBRATION
     )
@@ -123,7 +124,7 @@ def test_earlier_definition_is_the_one_that_was_recorded(changes, expected):
 def test_message_of_an_earlier_definition_is_read(model, padding, changes):
     calibration = rigs.calibrated('a', 6, model=model, max_iterations=2).calibrations['a']
     calibration = replace(calibration, noise_profile=None)
-    # Each empty sequence of float64 may leave four bytes at the end, of any content.
+    # Each empty float64 sequence may leave four padding bytes of arbitrary content at the end.
     data = earlier_bytes(calibration, changes) + b'\xff' * padding
     found = calibration_from_message(decode_fluoroscope_calibration(data))
     assert found.calibration_id == calibration.calibration_id

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bodies and joints of the reconstruction node without a graph: messages, files, who follows."""
+"""Bodies and joints of the reconstruction node without a graph: messages, files, following."""
 
 import re
 from dataclasses import replace
@@ -74,13 +74,13 @@ def rig(number=1, reject=4.0):
 
 
 def true_pose(row):
-    """Rotation and origin of both bodies in an exposure."""
+    """Return rotation and origin of both bodies in an exposure."""
     t = row / RATE_HZ
     return Rotation.from_rotvec(SPIN * t).as_matrix(), SPEED * t + [5, 3, -10]
 
 
 def exposure(row, visible=('femur', 'tibia'), rng=None):
-    """Intersected views of an exposure; without rng without noise."""
+    """Return the intersected views of an exposure; without rng, they are free of noise."""
     turn, origin = true_pose(row)
     shown = [body for body in BODIES if body.name in visible]
     ids = np.concatenate([[99], *(body.target_id for body in shown)]).astype(int)
@@ -109,7 +109,7 @@ def follow(follower, rows, number=1, **kind):
 
 
 def content_of(rotation, position_mm=(0, 0, 0), covariance=None, status=PoseStatus.OK):
-    """Content with one body."""
+    """Return the content of a message with one body."""
     poses = BodyPoses(
         'femur',
         np.array([7]),
@@ -140,8 +140,8 @@ def content_of(rotation, position_mm=(0, 0, 0), covariance=None, status=PoseStat
 def test_covariance_is_about_the_fixed_axes_of_the_header_frame():
     """A body that is uncertain along and about its own x axis only, turned by 90 degrees about z.
 
-    That axis is y of the frame of the header. A pose that is turned by hand about this y, after
-    its attitude, as REP 103 and robot_localization do, has its error in the same place.
+    That axis is y of the header frame. Rotating a pose manually about this y, after its attitude,
+    as REP 103 and robot_localization do, puts the error in the same place.
     """
     quarter = Rotation.from_euler('z', 90, degrees=True).as_matrix()
     own = np.diag([0.3**2, 0, 0, 0.02**2, 0, 0])  # mm, rad; along the axes of the body
@@ -184,7 +184,7 @@ def test_types_without_a_status_have_no_predicted_pose(status):
 
 
 def test_twist_is_that_of_the_origin_along_the_axes_of_the_body():
-    """The centre of the markers is some 50 mm/s faster or slower."""
+    """The centre of the markers moves some 50 mm/s faster or slower."""
     tracker = BodyTracker(orientation(), BODIES, lag=0)
     for row in range(60):
         found = tracker.add(exposure(row), row, stamp(row))
@@ -196,7 +196,7 @@ def test_twist_is_that_of_the_origin_along_the_axes_of_the_body():
 
 
 def test_covariance_of_the_twist_is_that_of_its_derivatives():
-    """Against differences of the twist by the state: R, then velocity and angular velocity."""
+    """Compared with finite differences of the twist by the state: R, then both velocities."""
     tracker = BodyTracker(orientation(), BODIES, lag=0)
     rng = np.random.default_rng(3)
     for row in range(30):
@@ -220,7 +220,7 @@ def test_covariance_of_the_twist_is_that_of_its_derivatives():
 
 
 def test_markers_of_a_body_are_where_its_pose_puts_them():
-    """For RViz: beads where they are, and axes of the body from their centre on."""
+    """For RViz: beads at their positions, and the axes of the body starting at their centre."""
     turn, origin = true_pose(60)
     content = content_of(turn, origin)
     axes, beads = body_markers(content, message_from_bodies(content)).markers
@@ -256,7 +256,7 @@ def test_follower_gives_the_poses_of_the_tracker():
 
 @pytest.mark.parametrize(('reject', 'markers'), [(4.0, 3), (None, 4)])
 def test_follower_leaves_out_what_is_false_by_the_limit_of_the_rig(reject, markers):
-    """A marker of the body that stands where no marker is; without a limit all are used."""
+    """A marker of the body appears where no marker is; without a limit, all markers are used."""
     follower = BodyFollower(BODIES, (), lag=0)
     rng = np.random.default_rng(5)
     for row in range(10):
@@ -270,7 +270,7 @@ def test_follower_leaves_out_what_is_false_by_the_limit_of_the_rig(reject, marke
 
 @pytest.mark.parametrize('change', ['orientation', 'recording that begins anew'])
 def test_new_tracker_first_gives_what_waits(change):
-    """No exposure is lost, and the new tracker begins without a motion."""
+    """No exposure is lost, and the new tracker starts without a motion."""
     follower = BodyFollower(BODIES, (), lag=5)
     assert len(follow(follower, range(10))) == 5
     row, number = (10, 2) if change == 'orientation' else (0, 1)
@@ -282,7 +282,7 @@ def test_new_tracker_first_gives_what_waits(change):
 
 
 def test_angles_of_a_joint_are_those_from_its_neutral_trial_on():
-    """Axes of the tibia are 0.3 rad off; a recording that begins anew has its own trial."""
+    """The axes of the tibia are 0.3 rad off; a restarted recording has its own neutral trial."""
     off = AnatomicalFrame(Rotation.from_euler('x', 0.3).as_matrix(), np.zeros(3))
     joint = Joint('knee', 'femur', 'tibia', 'cardan_xyz', distal_frame=off)
     free, zeroed = (
@@ -300,7 +300,7 @@ def test_angles_of_a_joint_are_those_from_its_neutral_trial_on():
 
 
 def taken_back(lag=0, rows=range(4)):
-    """A follower, what takes poses back, and what it publishes, after some exposures."""
+    """Return a follower, its retractions and what they publish, after some exposures."""
     joint = Joint('knee', 'femur', 'tibia', 'cardan_xyz')
     follower = BodyFollower(BODIES, [JointEntry(joint, None)], lag)
     published = []
@@ -312,9 +312,9 @@ def taken_back(lag=0, rows=range(4)):
 
 def test_a_pose_by_a_marker_that_is_taken_back_is_not_known_any_more():
     _, retractions, published = taken_back()
-    retractions.take_back(stamp(2), [99])  # of no body
+    retractions.take_back(stamp(2), [99])  # not a marker of any body
     retractions.take_back(stamp(2), [12])
-    retractions.take_back(stamp(2), [12, 13])  # the same pose
+    retractions.take_back(stamp(2), [12, 13])  # the same pose is not retracted twice
     assert retractions.count == len(published) == 1
     message = message_from_bodies(published[0])
     assert message.header.stamp == message_from_bodies(follow_one(2)).header.stamp

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnostics as lists of conditions, and services that are guarded."""
+"""Diagnostics as lists of conditions, and guarded services."""
 
 import asyncio
 from collections import Counter

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The view of the dashboard, on plain states."""
+"""The view of the dashboard, rendered from plain states."""
 
 import asyncio
 from dataclasses import replace
@@ -36,7 +36,7 @@ STATE = SessionState(
 
 
 class Recorded:
-    """A session that shows a state and records what is asked."""
+    """A session that shows a given state and records requests."""
 
     def __init__(self, state=STATE):
         self.shown = state

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the extraction node is made of: numbers of images, the queue, the process."""
+"""Parts of the extraction node: numbers of images, the queue, the worker process."""
 
 import multiprocessing
 import os
@@ -39,7 +39,7 @@ def test_images_without_a_stamp_are_counted_by_fluoroscope():
 
 
 def next_of(queue, name):
-    """Return the next item of a fluoroscope, None once the queue is closed."""
+    """Return the next item of a fluoroscope, or None once the queue is closed."""
     exposure = queue.get([name])
     return exposure and exposure[1][name]
 
@@ -50,7 +50,7 @@ def test_a_full_queue_sheds_the_oldest_exposure_that_is_not_begun():
     assert lost == [[]] * 4
     assert next_of(queue, 'a') == ('a', 1)
     assert queue.put('a', 3, ('a', 3)) == []
-    assert queue.put('b', 3, ('b', 3)) == ['a', 'b']  # exposure 2: its partner has begun 1
+    assert queue.put('b', 3, ('b', 3)) == ['a', 'b']  # exposure 2, since 1 has begun
     assert queue.put('a', 2, ('a', 2)) == ['a']  # too late
     assert [next_of(queue, 'b'), next_of(queue, 'b'), next_of(queue, 'a')] == [
         ('b', 1),
@@ -73,10 +73,10 @@ def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
     queue = ExposureQueue('ab', LATE + 1)
     for name, number in (('a', 1), ('b', 1), ('a', 2), ('b', 3)):
         queue.put(name, number, (name, number))
-    forever = 600.0  # what is lost is not waited for
+    forever = 600.0  # timeout [s] that must not be needed for lost images
     assert queue.get('ab', forever) == (1, {'a': ('a', 1), 'b': ('b', 1)})
-    assert queue.get('ab', forever) == (2, {'a': ('a', 2)})  # b is at 3
-    assert queue.get('ab', 0.0) == (3, {'b': ('b', 3)})  # of which a may still come
+    assert queue.get('ab', forever) == (2, {'a': ('a', 2)})  # b has already reached 3
+    assert queue.get('ab', 0.0) == (3, {'b': ('b', 3)})  # a may still deliver 3
     for number in range(4, 5 + LATE):
         queue.put('a', number, ('a', number))
     assert queue.get('ab', forever) == (4, {'a': ('a', 4)})  # b is several exposures late
@@ -89,10 +89,10 @@ def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
     ('a', 'b', 'complete'),
     [
         ([1], [1], True),
-        ([1], [], False),  # b may still come
-        ([1, 2], [], False),  # b is an exposure late, as in a burst
-        ([1, 2, 3], [], False),  # b is as late as it may be
-        ([1, 2, 3, 4], [], True),  # b is not waited for any longer
+        ([1], [], False),  # b may still arrive
+        ([1, 2], [], False),  # b is one exposure late, as in a burst
+        ([1, 2, 3], [], False),  # b has the largest allowed delay
+        ([1, 2, 3, 4], [], True),  # the queue stops waiting for b
         ([1], [2], True),  # b has lost it
         ([], [3], False),
         ([], [3, 4, 5, 6], True),
@@ -122,7 +122,7 @@ def test_closing_a_queue_ends_the_wait():
 
 
 class Fragile:
-    """Follower that counts images, and fails as the first pixel says."""
+    """Follower that counts images, and fails as the first pixel of the image requests."""
 
     def __init__(self):
         self.count = 0
@@ -135,7 +135,7 @@ class Fragile:
         if image[0, 0] == 2:
             raise SystemExit(3)
         if image[0, 0] == 3:
-            threading.Event().wait()  # until it is ended
+            threading.Event().wait()  # until terminated
         return {'a': Observations(expected=self.count)}
 
 
@@ -154,7 +154,7 @@ def test_a_failure_loses_one_image_an_interrupt_none_and_closing_ends_the_one_in
     assert extract(0) == 3
     with pytest.raises(RuntimeError, match='ended with status 3'):
         extract(2)
-    assert extract(0) == 1  # a new process
+    assert extract(0) == 1  # a new process has been started
     errors = []
 
     def last():

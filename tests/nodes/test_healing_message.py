@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the result of Heal says of a rig that changes while it is recorded."""
+"""The Heal result of a rig that changes during the recording."""
 
 from types import SimpleNamespace
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of the nodes against hostile peers: ids of messages, lines of the log, limits."""
+"""Parts of the nodes against hostile peers: ids of messages, log lines, limits."""
 
 import os
 import subprocess
@@ -42,7 +42,7 @@ SPECIAL = [
 
 
 def orientation(rng, special=False):
-    """A random orientation of two fluoroscopes, with equal quaternion components if special."""
+    """Return a random orientation of two fluoroscopes; special: equal quaternion components."""
     rotation = [
         SPECIAL[rng.integers(len(SPECIAL))] if special else Rotation.random(random_state=rng)
         for _ in range(2)
@@ -67,7 +67,7 @@ def orientation(rng, special=False):
 
 @pytest.mark.parametrize('special', [False, True])
 def test_orientation_keeps_its_id_through_a_message(special):
-    """Metres and quaternions differ in the last bits; both sides round to the same values."""
+    """Metres and quaternions differ in the last bits, but both sides round to the same values."""
     rng = np.random.default_rng(3)
     for _ in range(100):
         sent = orientation(rng, special).rounded()
@@ -121,7 +121,7 @@ def test_changed_calibration_is_refused(field, value):
 
 @pytest.mark.parametrize('changed', [False, True])
 def test_id_of_earlier_versions_is_refused(changed):
-    """It does not show changes of what does not determine a correction."""
+    """The earlier id ignores changes of fields that do not determine the correction."""
     calibration = rigs.calibrated('a', 5, model='none').calibrations['a']
     message = message_from_calibration(calibration)
     message.calibration_id = calibration.earlier_id
@@ -143,7 +143,7 @@ def test_id_of_earlier_versions_is_refused(changed):
     ],
 )
 def test_hostile_calibration_with_a_valid_id_is_refused(change, sentence):
-    """Whoever can change the content can compute the id: what would take memory is refused."""
+    """A peer can compute the id of changed content: what would take much memory is refused."""
     calibration = rigs.calibrated('a', 5, model='none').calibrations['a']
     if 'model' in change:
         k, count = change['model']
@@ -156,7 +156,7 @@ def test_hostile_calibration_with_a_valid_id_is_refused(change, sentence):
 
 
 def test_calibrated_area_with_too_many_corners_is_refused():
-    """Each pixel is compared with each of them."""
+    """Each pixel is compared with every corner."""
     message = message_from_calibration(rigs.calibrated('a', 5, model='none').calibrations['a'])
     angle = np.linspace(0, 2 * np.pi, 1100, endpoint=False)
     message.train_u = 500 + 400 * np.cos(angle)
@@ -171,7 +171,7 @@ def test_calibrated_area_with_too_many_corners_is_refused():
 
 
 class Lines:
-    """A logger that keeps what it is given."""
+    """A logger that keeps its messages."""
 
     def __init__(self):
         self.lines = []
@@ -227,7 +227,7 @@ def test_command_line_cannot_print_forged_lines(tmp_path, capsys, kind):
     ],
 )
 def test_wrong_arguments_of_ros_are_told_in_a_sentence(tmp_path, arguments, sentence):
-    """The second would wait for ever."""
+    """The second set of arguments would otherwise make the node wait forever."""
     os.mkfifo(tmp_path / 'pipe')
     words = [str(tmp_path / 'pipe') if word == 'PIPE' else word for word in arguments]
     command = [sys.executable, '-m', 'fluoro_calib_ros.nodes.correction_node', '--ros-args']
@@ -237,7 +237,7 @@ def test_wrong_arguments_of_ros_are_told_in_a_sentence(tmp_path, arguments, sent
 
 
 def test_exposures_are_limited():
-    """Each new one is compared with all: without a limit a peer could stop the stream."""
+    """Each new exposure is compared with all others: unlimited, a peer could stop the stream."""
     frames = rigs.exposures()
     settings = SimpleNamespace(limits=SimpleNamespace(max_exposures=0))
     exposures = ExposureInput.__new__(ExposureInput)

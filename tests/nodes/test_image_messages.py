@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Images of messages: the order of bytes concerns those of 16 bits only."""
+"""Images in messages: byte order matters for 16-bit images only."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages that hold more than the limits allow, or nonsense, give one sentence."""
+"""Messages that exceed the limits or contain nonsense are reported in one sentence."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture
 def limited():
-    """Set limits, which are the default ones again after the test."""
+    """Set limits, and restore the default ones after the test."""
     yield lambda **changes: use_read_limits(ReadLimits(**changes))
     use_read_limits(ReadLimits())
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""--help of the nodes, and parameters that they do not have."""
+"""--help of the nodes, and parameters that a node does not have."""
 
 import importlib
 import re
@@ -58,7 +58,7 @@ def test_unknown_parameters_are_told_with_what_was_meant():
         has_parameter=known.__contains__,
         get_parameters_by_prefix=lambda prefix: known,
     )
-    given['still_px'] = None  # of another node: a file may give it to all
+    given['still_px'] = None  # belongs to another node: a parameter file may set it for all nodes
     assert unknown_parameters(node) == [
         'there is no parameter phantm, it has no effect; did you mean phantom?',
         'there is no parameter zzz, it has no effect; --help lists the parameters',
@@ -84,7 +84,7 @@ def test_help_tells_the_range_of_a_parameter(bounds, ends):
     [('__main__', 'other_node'), ('fluoro_calib_ros.nodes.own_node', 'own_node')],
 )
 def test_help_has_the_name_that_is_typed(name, shown):
-    """A module that runs as __main__ has its name in its specification only."""
+    """A module that runs as __main__ has its name only in its module specification."""
     module = ModuleType(name, 'Node that does nothing.')
     module.__spec__ = ModuleSpec('fluoro_calib_ros.nodes.other_node', None)
     module.PARAMETERS = ()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What parts of the nodes count, decide and pass on, on plain objects without a graph."""
+"""Counts, decisions and outputs of parts of the nodes, on plain objects without a graph."""
 
 from collections import Counter
 from dataclasses import replace
@@ -70,7 +70,7 @@ from fluoro_calib_ros.reconstruction.intersection import (
 
 
 class Log:
-    """A logger that keeps what it is told by level."""
+    """A logger that stores messages by level."""
 
     def __init__(self):
         self.lines = Counter()
@@ -103,7 +103,7 @@ def test_log_takes_a_burst_then_a_message_a_second_and_counts_the_others(monkeyp
     limited.error('lost')
     limited.error('lost')
     assert log.lines == {'warning': 20, 'error': 1} and '(6 similar' in log.texts[-1]
-    now = 1000.0  # silence is no credit beyond a burst
+    now = 1000.0  # a long silence allows no more than one burst
     for _ in range(25):
         limited.warning('late')
     assert log.lines == {'warning': 40, 'error': 1}
@@ -220,7 +220,7 @@ def test_frame_that_can_be_corrected_is_passed_on():
     for unnamed in (observed(frame_id=''), observed()):
         assert validator.validated_arrays(unnamed, CALIBRATION)
     assert validator.validated_arrays(observed(), replace_id('')) is not None
-    # Ids that have changed are examined again.
+    # Changed ids are checked again.
     with pytest.raises(Refused):
         validator.validated_arrays(observed((5, 5)), CALIBRATION)
 
@@ -304,7 +304,7 @@ def test_angles_are_given_counted_and_doubted_once():
     assert 'names no joint' in made.health('b', {}).message
     made.of_frame('a', 1005 * 10**6, needed=True)
     made.of_frame('a', 99 * 10**9, needed=True)
-    assert log.lines['warning'] == 3  # told again after it was known
+    assert log.lines['warning'] == 3  # reported again after the angle was known in between
 
 
 def test_faults_of_joint_states_are_not_those_of_the_stream():
@@ -412,7 +412,7 @@ def test_window_has_the_frames_of_a_time_in_which_markers_are_seen(monkeypatch):
     for stamp_s, one in ((0, other), (1, shown), (1.5, shown), (1.7, other), (9, shown)):
         found.add('a', replace(one, stamp_ns=int(1e9 * stamp_s)), None)
     assert found.count == 3 and found.seen_s == 0.5 and not found.is_complete
-    for stamp_s in (9.4, 9.8, 10.0):  # enough with the second one
+    for stamp_s in (9.4, 9.8, 10.0):  # the second frame completes the window
         found.add('a', replace(shown, stamp_ns=int(1e9 * stamp_s)), None)
     assert found.count == 5 and found.is_complete
     assert found.frames['a'][-1].stamp_ns == int(1e9 * 9.8)
@@ -425,7 +425,7 @@ def test_parameters_that_only_ask_make_no_new_watches():
     monitor = DriftMonitor('ab', DriftParameters(), None, Log())
     assert not monitor.use(DriftParameters(collect_on_drift=True, heal_on_drift=True))
     assert monitor.use(DriftParameters(collect_on_drift=True, heal_on_drift=True, drift_rate=5.0))
-    assert monitor.make_watch(None) is None  # sizes are not known
+    assert monitor.make_watch(None) is None  # image sizes are unknown
     assert monitor.use(DriftParameters(drift_watch=False))
     monitor.newest = None, 'o', 7
     assert monitor.publish_state() == []

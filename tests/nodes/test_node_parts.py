@@ -74,7 +74,7 @@ def test_rows_of_16_bits_may_begin_at_any_byte(calibration, gap):
 
 
 def test_long_names_are_truncated_in_messages(calibration):
-    """An error message goes into the log, and into the diagnostics every second."""
+    """An error message goes to the log, and to the diagnostics every second."""
     width, height = SIZE
     message = Image(width=width, height=height, encoding='x' * 10**6, step=width)
     with pytest.raises(Refused) as refused:
@@ -96,17 +96,17 @@ def test_long_names_are_truncated_in_messages(calibration):
     ids=lambda x: x if isinstance(x, str) else '',
 )
 def test_calibration_with_impossible_numbers_is_refused(calibration, change, said):
-    """A message is refused for what a file is refused for, although its id matches."""
+    """A message is refused for the same reasons as a file, although its id matches."""
     message = message_from_calibration(replace(calibration, **change))
     with pytest.raises(DataError, match=f'calibration of fluoroscope a: the array {said}'):
         calibration_from_message(message)
 
 
 class Inbox:
-    """A CalibrationInput that records its calls; preparing waits for .go, and may have a fault.
+    """A CalibrationInput that records its calls; preparation waits for .go and may raise a fault.
 
-    fault: raised for all calibrations, or those with the stamp in at_ns. put takes a message to
-    the last of the fluoroscopes, putters one for each.
+    fault: raised for all calibrations, or only for the stamp at_ns. put accepts messages of the
+    last fluoroscope; putters has one such function per fluoroscope.
     """
 
     def __init__(self, fault=None, names=('a',), at_ns=None):
@@ -165,9 +165,9 @@ def test_calibrations_are_prepared_one_at_a_time_and_the_last_one_stays(calibrat
     for number in range(50):
         inbox.put(message_from_calibration(replace(calibration, stamp_ns=number)))
         if number == 0:
-            assert inbox.began.acquire(timeout=60)  # the first is at work
+            assert inbox.began.acquire(timeout=60)  # preparation of the first has begun
     inbox.go.set()
-    assert all(inbox.ended.acquire(timeout=60) for _ in range(2))  # what came last was next
+    assert all(inbox.ended.acquire(timeout=60) for _ in range(2))  # the last one came next
     assert inbox.taken == [0, 49] and inbox.most == 1 and inbox.calibrations.current('a') == 49
     inbox.put(message_from_calibration(replace(calibration, stamp_ns=99)))
     assert inbox.ended.acquire(timeout=60) and inbox.taken[-1] == 99
@@ -181,7 +181,7 @@ def test_calibrations_of_several_fluoroscopes_that_come_together_are_used_togeth
         inbox.putters[name](message_from_calibration(of_one))
 
     put('a', 1)
-    assert inbox.began.acquire(timeout=60)  # while it is at work,
+    assert inbox.began.acquire(timeout=60)  # while a is being prepared,
     put('b', 2)
     inbox.go.set()
     assert inbox.ended.acquire(timeout=60)
@@ -205,7 +205,7 @@ def test_calibration_is_used_where_the_one_that_came_with_it_is_refused(calibrat
 
 
 def test_calibration_that_comes_while_the_thread_before_it_ends_is_prepared(calibration):
-    """That thread has found nothing more to do, but is still there."""
+    """The thread has found no further work but has not yet ended."""
     inbox = Inbox()
     inbox.go.set()
     inbox.calibrations._threads['a'] = threading.current_thread()
@@ -239,7 +239,7 @@ def test_calibration_that_cannot_be_prepared_is_refused(calibration, fault):
 
 
 def test_calibration_message_that_is_too_large_is_refused_undecoded(calibration, monkeypatch):
-    """By a byte; one of that size is read, and a damaged one is refused by itself."""
+    """One byte is too many; a damaged message of the allowed size is refused after decoding."""
     message = message_from_calibration(calibration)
     size = len(serialize_message(message))
     for most, sentences in ((size - 1, 1), (size, 0)):
@@ -259,7 +259,7 @@ def test_calibration_message_that_is_too_large_is_refused_undecoded(calibration,
 
 
 def test_calibrations_wait_while_two_nodes_publish_them(calibration):
-    """The newest one is used when one node is left."""
+    """The newest calibration is used once only one node is left."""
     inbox = Inbox()
     inbox.go.set()
     one, other = (SimpleNamespace(node_namespace='/', node_name=name) for name in 'xy')
@@ -278,7 +278,7 @@ def test_calibrations_wait_while_two_nodes_publish_them(calibration):
 
 
 def orientation_service(output):
-    """The service orient of a rig of a and b, and what a request asks of it."""
+    """Return the service orient of a rig of a and b, and a request to it."""
     node = SimpleNamespace(
         create_timer=lambda *_, **__: None,
         destroy_timer=lambda _: None,
@@ -315,7 +315,7 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
 
     monkeypatch.setattr(calibration_services, 'in_thread', lambda *_: (recalibrated(), None))
     capture = service._orient(request)
-    capture.send(None)  # it waits for its frames
+    capture.send(None)  # the capture waits for its frames
     service.add({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
     with pytest.raises(DataError, match='the calibrations have changed meanwhile'):
         capture.send(None)
@@ -354,14 +354,14 @@ def test_unknown_home_folder_is_refused():
 
 @pytest.mark.long
 def test_demo_runs_as_a_module():
-    """Also where the console script is not installed."""
+    """It also works where the console script is not installed."""
     command = [sys.executable, '-m', 'fluoro_calib_ros.demo.demo', '--help']
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and '--bags' in done.stdout, done.stderr
 
 
 def test_demo_leaves_ros_to_the_nodes():
-    """Its modules import no ROS package themselves."""
+    """The modules of the demo do not import ROS packages themselves."""
     for path in (ROOT / 'fluoro_calib_ros' / 'demo').glob('*.py'):
         imports = re.findall(r'^\s*(?:from|import) (\w+)', path.read_text(), re.MULTILINE)
         assert not [name for name in imports if name == 'rclpy' or name.endswith('_msgs')], path

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters: declared once, and the same in the nodes, in config/ and in docs/."""
+"""Parameters are declared once, and are the same in the nodes, config/ and docs/."""
 
 import dataclasses
 import sys
@@ -49,7 +49,7 @@ def test_config_holds_every_parameter_with_its_default(node):
 
 
 def test_config_is_generated_from_the_declarations():
-    """Comments included; `python -m tools.write_tables` writes it."""
+    """Comments are included; `python -m tools.write_tables` writes the file."""
     assert (ROOT / 'config' / 'fluoro_calib.yaml').read_text() == write_tables.yaml_text()
 
 
@@ -65,7 +65,7 @@ def test_table_of_the_calibration_file_is_generated_from_its_record():
 
 
 def test_parameters_of_the_calibration_are_its_options():
-    """Choices, range and description are those of the command line."""
+    """Choices, range and description equal those of the command line."""
     parameters = write_tables.parameters('calibration_node')
     options = declared(CalibrationOptions)
     for name in ('model', 'interior', 'loss', 'max_iterations', 'relative_orientation', 'datum'):
@@ -199,7 +199,7 @@ SETTABLE = ParameterGroup(
 
 
 class Settings(ParameterNode):
-    """Node with settable parameters, and one that is not."""
+    """Node with settable parameters and one read-only parameter."""
 
     def __init__(self, context):
         super().__init__('test', context=context)

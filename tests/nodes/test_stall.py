@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A stream that stops, and faults that are over."""
+"""A stream that stops, and faults that have ended."""
 
 from fluoro_calib_ros.nodes.runtime.diagnostics import RECENT_S, RecentCounts, StallDetector
 
 
 class Clock:
-    """A clock that is set by hand."""
+    """A clock that is set manually."""
 
     def __init__(self):
         self.time = 100.0
@@ -17,7 +17,7 @@ class Clock:
 
 
 def messages(counts):
-    """What a detector says of counts that it is asked about once a second."""
+    """Return the messages of a detector that is queried about its counts once a second."""
     clock = Clock()
     detector = StallDetector(clock)
     said = []

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a node loads when it starts, which is most of the time until it is ready."""
+"""Modules that a node loads at startup, which takes most of the time until it is ready."""
 
 import subprocess
 import sys

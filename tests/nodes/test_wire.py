@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The bytes of stream messages, against the serialization of rclpy and of rosbags."""
+"""The bytes of stream messages, compared with the serialization of rclpy and of rosbags."""
 
 import contextlib
 from array import array
@@ -47,7 +47,7 @@ _COVARIANCE = {'cov_xx': 0, 'cov_xy': 1, 'cov_xz': 2, 'cov_yy': 4, 'cov_yz': 5, 
 
 
 def message_from_points(content):
-    """The message of reconstructed points, field by field."""
+    """Return the message of reconstructed points, field by field."""
     orientation = content.orientation
     points = content.points
     message = ReconstructedPoints()
@@ -90,7 +90,7 @@ def corrected(n, seed=0):
 
 
 def message_of(source, calibration_id, arrays):
-    """Return the CorrectedObservations message as rclpy makes it."""
+    """Return the CorrectedObservations message as built with rclpy."""
     message = CorrectedObservations(
         header=source.header,
         frame_number=source.frame_number,
@@ -117,7 +117,7 @@ def test_observations_are_read_as_rclpy_reads_them(n, frame_id, sigma):
 
 
 def test_observations_with_empty_arrays_are_read():
-    """An empty sequence is not aligned, but what follows it is."""
+    """An empty sequence is not aligned, but the data after it are."""
     for lengths in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (2, 1, 0), (0, 3, 3)):
         for ids in (0, 1, 2):
             message = TargetObservations(target_id=uint32_field(range(ids)))
@@ -141,12 +141,9 @@ def test_corrected_observations_are_written_as_rclpy_reads_them(n, frame_id, sig
             decode_target_observations(serialize_message(source)), calibration_id, arrays
         )
         expected = message_of(source, calibration_id, arrays)
-        assert len(data) <= len(
-            serialize_message(expected)
-        )  # that may end with bytes that mean nothing
-        assert repr(deserialize_message(data, CorrectedObservations)) == repr(
-            expected
-        )  # NaN differs from itself
+        assert len(data) <= len(serialize_message(expected))  # rclpy may append meaningless bytes
+        # Compare representations, since NaN differs from itself.
+        assert repr(deserialize_message(data, CorrectedObservations)) == repr(expected)
 
 
 @pytest.mark.parametrize('n, frame_id, _', SIZES)
@@ -235,7 +232,7 @@ def test_damaged_bytes_raise_nothing_but_value_error(read, data):
 
 @pytest.mark.parametrize('read, data', READERS)
 def test_big_endian_messages_are_read_too(read, data):
-    """A message of empty sequences, written by hand in big-endian order."""
+    """A message of empty sequences, written manually in big-endian order."""
     count = 3 if read is decode_target_observations else 0
     numbers = (
         [(1, 4), (2, 4), (2, 4), (0x61000000, 4), (7, 4)]
@@ -305,7 +302,7 @@ def test_points_are_read_by_rosbags(n, ids):
 @pytest.mark.parametrize('n', [0, 1, 2, 20, 21])
 @pytest.mark.parametrize('sigma', [True, False])
 def test_bags_read_what_rclpy_writes(n, sigma):
-    """Also without sigma, where Fast DDS pads the message behind its last, empty sequence."""
+    """Include messages without sigma, where Fast DDS pads after the last, empty sequence."""
     message = TargetObservations(frame_number=7, image_width=8, image_height=9)
     message.target_id = uint32_field(np.arange(n))
     message.u = message.v = float64_field(np.arange(n) / 3)

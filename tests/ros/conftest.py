@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fixtures of the tests with real nodes: a ROS domain, graphs, and a calibration."""
+"""Fixtures for tests with real nodes: a ROS domain, graphs and a calibration."""
 
 import fcntl
 import os
@@ -24,7 +24,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope='session')
 def ros(tmp_path_factory):
-    """Initialise rclpy in a ROS domain of this session; nodes inherit it by the environment."""
+    """Initialise rclpy in the ROS domain of this session; nodes inherit its environment."""
     import rclpy
 
     domain, lock = free_domain()
@@ -39,7 +39,7 @@ def ros(tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def node_server():
-    """Return the process that the nodes of this session are forked from."""
+    """Return the server process from which the nodes of this session are forked."""
     server = NodeServer()
     yield server
     server.close()
@@ -49,7 +49,7 @@ def _graph(request, directory):
     graph = Graph(directory, request.getfixturevalue('node_server'))
     request.node.graphs = [*getattr(request.node, 'graphs', ()), graph]
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in graph.environment.items():  # of commands that a test runs beside it
+        for name, value in graph.environment.items():  # also for commands that a test runs itself
             patch.setenv(name, value)
         yield graph
     graph.close()
@@ -77,25 +77,25 @@ def pytest_runtest_makereport(item):
             for graph in getattr(node, 'graphs', ()):
                 report.sections.extend(
                     graph.last_words(end=node is item)
-                )  # others still need theirs
+                )  # other tests still need their nodes
 
 
 @pytest.fixture(scope='session')
 def exposures():
-    """Frames of bags/calibration by fluoroscope."""
+    """Frames of bags/calibration, by fluoroscope."""
     return read_frames(BAGS / 'calibration').frames
 
 
 @pytest.fixture(scope='session')
 def tracking():
-    """Frames of bags/tracking by fluoroscope."""
+    """Frames of bags/tracking, by fluoroscope."""
     return read_frames(BAGS / 'tracking').frames
 
 
 def made_once(tmp_path_factory, name, make):
-    """Return a folder that the first worker of this session that needs it makes by make(folder).
+    """Return a folder that make(folder) fills once per session, in the first worker to need it.
 
-    No test may change it.
+    Tests must not change the folder.
     """
     root = tmp_path_factory.getbasetemp()
     if 'PYTEST_XDIST_WORKER' in os.environ:
@@ -119,17 +119,17 @@ def _calibrate_by_command(folder):
 
 @pytest.fixture(scope='session')
 def by_command(tmp_path_factory):
-    """Folder with a calibration of bags/calibration by the command line."""
+    """Folder with a calibration of bags/calibration made by the command line."""
     folder = tmp_path_factory.mktemp('by_command') / 'result'
     shutil.copytree(
         made_once(tmp_path_factory, 'by_command', _calibrate_by_command), folder
-    )  # nodes may save there
+    )  # nodes may save to this folder
     return folder
 
 
 @pytest.fixture(scope='session')
 def by_second_command(tmp_path_factory):
-    """Folder with the result of the same command, run once more."""
+    """Folder with the result of a second run of the same command."""
     folder = tmp_path_factory.mktemp('by_second_command')
     _calibrate_by_command(folder)
     return folder

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Publishes observations of fluoroscope a until it is ended: 10,000 messages a second.
+"""Publish 10,000 observations of fluoroscope a per second until terminated.
 
-Every hundredth has 100,000 points, the others none of the calibrated fluoroscope.
+Every hundredth message has 100,000 points; the others have none of the calibrated fluoroscope.
 """
 
 import itertools

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Nodes as processes that are forked from one that has loaded the modules of all nodes.
+"""Run nodes as forks of a process that has already loaded the modules of all nodes.
 
-Loading them costs a second of CPU time for each node, more than most tests do with it. A forked
-node is a process like any other: arguments, environment, signals, end of its interpreter.
+Loading the modules costs a second of CPU time per node, more than most tests spend on it. A forked
+node is a process like any other, with arguments, environment, signals and interpreter shutdown.
 
-Run as a program with the file descriptor of a socket, this is the process that is forked. A
+Run as a program with the file descriptor of a socket, this module is the process to fork. A
 request is a line of JSON with the module, the arguments, the environment and the path of the log;
 the answer is {"pid": ...}, and {"pid": ..., "status": ...} follows at the end of the node.
 """
@@ -33,7 +33,7 @@ ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), '1')
 
 
 class NodeServer:
-    """The process that nodes are forked from, as its user sees it."""
+    """Client side of the process from which nodes are forked."""
 
     def __init__(self):
         self._socket, theirs = socket.socketpair()
@@ -41,16 +41,16 @@ class NodeServer:
             self._process = subprocess.Popen(
                 [sys.executable, __file__, str(theirs.fileno())],
                 cwd=ROOT,
-                env={**os.environ, **ONE_THREAD},  # more threads would be lost in the fork
+                env={**os.environ, **ONE_THREAD},  # further threads would not survive the fork
                 pass_fds=[theirs.fileno()],
-                start_new_session=True,  # an interrupt of the tests is not for it
+                start_new_session=True,  # an interrupt of the tests must not reach it
             )
         self._lines = _Lines(self._socket)
         self._statuses = {}
         self._started = []
 
     def start(self, node, arguments, log, environment):
-        """Start a node, and return its ForkedNode."""
+        """Start a node and return its ForkedNode."""
         Path(log).touch()
         request = {
             'module': f'{PACKAGE}.{node}',
@@ -64,7 +64,7 @@ class NodeServer:
         return ForkedNode(self, self._started.pop())
 
     def status(self, pid, seconds=0.0):
-        """Return the exit status of a node, None if it has not ended within so many seconds."""
+        """Return the exit status of a node, or None if it has not ended within `seconds`."""
         end = time.monotonic() + seconds
         while pid not in self._statuses:
             left = end - time.monotonic()
@@ -74,7 +74,7 @@ class NodeServer:
         return self._statuses.get(pid)
 
     def close(self):
-        """End the process; its nodes have ended before."""
+        """End the server process; its nodes must have ended before."""
         self._socket.close()
         self._process.wait()
 
@@ -89,7 +89,7 @@ class NodeServer:
 
 
 class ForkedNode:
-    """A node with what subprocess.Popen has for it."""
+    """A node with the interface of subprocess.Popen."""
 
     def __init__(self, server, pid):
         self._server = server
@@ -114,14 +114,14 @@ class ForkedNode:
 
 
 class _Lines:
-    """Documents of JSON from a socket, one a line."""
+    """JSON documents from a socket, one per line."""
 
     def __init__(self, connection):
         self._socket = connection
         self._rest = b''
 
     def read(self):
-        """Return what has come. Raises EOFError at the end of the connection."""
+        """Return the documents that have arrived. Raise EOFError at the end of the connection."""
         received = self._socket.recv(1 << 16)
         if not received:
             raise EOFError('the node server has ended')
@@ -134,9 +134,9 @@ class _Lines:
 
 
 def serve(connection):
-    """Fork a process for each request until the user has gone.
+    """Fork a process for each request until the client disconnects.
 
-    Returns the request in each of those processes, and None at the end of this one.
+    Return the request in each forked process, and None in this process when it ends.
     """
     woken, wake = os.pipe()
     os.set_blocking(wake, False)
@@ -167,7 +167,7 @@ def serve(connection):
 
 
 def _tell_ended(connection):
-    """Tell the exit statuses of the processes that have ended."""
+    """Report the exit statuses of the processes that have ended."""
     with contextlib.suppress(ChildProcessError):
         while True:
             pid, status = os.waitpid(-1, os.WNOHANG)
@@ -178,7 +178,7 @@ def _tell_ended(connection):
 
 
 def run_node(request):
-    """Run a node in this process; the process ends with it."""
+    """Run a node in this process, which ends with the node."""
     os.setsid()
     log = os.open(request['log'], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     for stream in (1, 2):
@@ -187,8 +187,8 @@ def run_node(request):
     os.environ.clear()
     os.environ.update(request['environment'])
     faulthandler.enable()
-    # The interpreter ends as that of any program, but not the libraries: LTTng, which rclpy loads,
-    # would end threads that are not in a forked process.
+    # The interpreter shuts down as in any program, but its libraries do not: LTTng,
+    # which rclpy loads, would end threads that do not exist in a forked process.
     libc = ctypes.CDLL(None)
     libc.on_exit(libc._exit, None)
     module = importlib.import_module(request['module'])
@@ -201,7 +201,7 @@ def main():
     connection = socket.socket(fileno=int(sys.argv[1]))
     for node in NODES:
         importlib.import_module(f'{PACKAGE}.{node}')
-    gc.freeze()  # the processes share these pages
+    gc.freeze()  # the forked processes share these memory pages
     request = serve(connection)
     if request is not None:
         run_node(request)

@@ -59,7 +59,7 @@ from fluoro_calib_ros.nodes.runtime.topics import OBSERVATION_DEPTH, latched_qos
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
 DEADLINE = 60.0  # seconds; nothing takes a tenth of it on an idle machine
-JOB_DEADLINE = 240.0  # of self-calibrations and extractions, which have a low priority
+JOB_DEADLINE = 240.0  # seconds; for self-calibrations and extractions, which run at low priority
 NAMES = ('a', 'b')
 SUCCEEDED = GoalStatus.STATUS_SUCCEEDED
 CANCELED = GoalStatus.STATUS_CANCELED
@@ -100,20 +100,20 @@ SERVICES = {
 
 
 def lost_ports(name, pid):
-    """Return a line with the ports of Fast DDS that a process uses although they were removed."""
+    """Return a line listing removed Fast DDS ports that a process still uses."""
     maps = Path(f'/proc/{pid}/maps').read_text().splitlines()
     lost = {line.split()[-2] for line in maps if 'fastrtps_port' in line and 'deleted' in line}
     return f'{name}: {", ".join(sorted(lost)) or "none"}'
 
 
 def entry_point(node):
-    """Return the command that runs a node, or the command line fluoro-calib."""
+    """Return the command that runs a node or the command-line program fluoro-calib."""
     module = 'fluoro_calib_ros.cli' if node == 'cli' else f'fluoro_calib_ros.nodes.{node}'
     return [sys.executable, '-m', module]
 
 
 class Process:
-    """A command as a process of its own; its output is in .log."""
+    """A command in its own process; its output is in .log."""
 
     def __init__(self, command, path, environment=None):
         self.path = path
@@ -151,13 +151,13 @@ class Process:
         return self.wait()
 
     def abort(self):
-        """End the process so that it prints where its threads are."""
+        """End the process so that it prints the stack of each thread."""
         if self.running:
             self._process.send_signal(signal.SIGABRT)
             self.wait()
 
     def end(self, seconds=10.0):
-        """Interrupt the process, kill it where that fails, and return its exit status."""
+        """Interrupt the process, kill it if that fails, and return its exit status."""
         if self.running:
             self.interrupt()
         try:
@@ -168,7 +168,7 @@ class Process:
 
 
 class ForkedProcess(Process):
-    """A node as a process that is forked from the NodeServer."""
+    """A node as a process forked from the NodeServer."""
 
     def __init__(self, server, node, arguments, path, environment):
         self.path = path
@@ -176,13 +176,13 @@ class ForkedProcess(Process):
 
 
 class Graph:
-    """Nodes and a client in a ROS domain and a namespace of their own.
+    """Nodes and a client in their own ROS domain and namespace.
 
-    No graph uses the ports of one that has just ended: Fast DDS removes those in shared memory at
-    the end of a process, and a node that opens one meanwhile may lose all messages to it.
+    No graph reuses the ports of one that has just ended: Fast DDS removes its shared-memory ports
+    when a process ends, and a node that opens one meanwhile may lose all messages sent to it.
 
-    .fork: whether nodes are forked from a process that has loaded their modules; else each is the
-    command of a user.
+    .fork: whether nodes are forked from a process that has loaded their modules; otherwise each
+    is started by the command that users run.
     """
 
     _numbers = itertools.count(1)
@@ -200,7 +200,7 @@ class Graph:
         self.client = Client(self.namespace, self._context)
 
     def start(self, node, parameters=None, remaps=None, wait=True):
-        """Start a node with parameters and remaps; returns its Process once the client is
+        """Start a node with parameters and remaps; return its Process once the client is
         connected.
         """
         number = len(self.processes)
@@ -210,7 +210,7 @@ class Graph:
         for key, value in {
             '__ns': self.namespace,
             **(remaps or {}),
-        }.items():  # of two rules the first counts
+        }.items():  # of two rules, the first takes effect
             arguments += ['-r', f'{key}:={value}']
         log = self.directory / f'{number}_{node}.log'
         if self.fork:
@@ -230,7 +230,7 @@ class Graph:
         )
 
     def both_nodes(self, directory, **parameters):
-        """Start calibration node and correction node together; returns their processes by name."""
+        """Start the calibration and correction nodes together; return their processes by name."""
         nodes = {
             'calibration_node': self.calibration_node(directory, wait=False, **parameters),
             'correction_node': self.start('correction_node', wait=False),
@@ -240,9 +240,9 @@ class Graph:
         return nodes
 
     def whole_chain(self, directory, reconstruction=None, **parameters):
-        """Start the three nodes with the calibrations and the orientation of a folder.
+        """Start the three nodes with the calibrations and the orientation stored in a folder.
 
-        Returns the processes by name once points can be reconstructed.
+        Return the processes by name once points can be reconstructed.
         """
         nodes = {
             **self.both_nodes(directory, **parameters),
@@ -259,14 +259,14 @@ class Graph:
         return nodes
 
     def wait_for_readers(self, count, node='correction_node', names=NAMES, key='readers'):
-        """Wait until a node has discovered `count` readers of its output of every fluoroscope."""
+        """Wait until a node has discovered `count` readers of its output for every fluoroscope."""
         for name in names:
             self.client.wait_for_diagnostics(
                 node, lambda s: int(value_of(s, key) or 0) >= count, name, f'the {key}'
             )
 
     def play(self, bag, readers, rate=10.0):
-        """Play a bag to the end."""
+        """Play a bag to its end."""
         player = self.start(
             'player_node', {'bag': bag, 'rate': rate, 'wait_for_readers': readers}, wait=False
         )
@@ -274,9 +274,9 @@ class Graph:
         assert player.wait() == 0, player.log
 
     def last_words(self, end):
-        """Return (title, text) of the last statuses and of the logs of all nodes.
+        """Return (title, text) pairs with the last statuses and the logs of all nodes.
 
-        end: whether the nodes are aborted, so that their logs show where the threads are.
+        end: whether to abort the nodes, so that their logs show the stack of each thread.
         """
         running = {p.path.stem: p.pid for p in self.processes if p.running}
         ports = '\n'.join(map(lost_ports, ['client', *running], [os.getpid(), *running.values()]))
@@ -301,7 +301,7 @@ class Graph:
 
 
 class Client(Node):
-    """A user of the graph; messages[topic] collects the messages since listen(topic)."""
+    """A user of the graph; messages[topic] holds the messages received since listen(topic)."""
 
     def __init__(self, namespace, context):
         super().__init__('client', namespace=namespace, context=context)
@@ -313,7 +313,7 @@ class Client(Node):
         self._callers = {}
         for service, kind in SERVICES.items():
             self.expect(kind, service)
-        # A queue for a machine that is too busy for the rate.
+        # Deep enough for a machine that is too busy to keep up with the rate.
         deep = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
         self._outputs = {
             n: self.create_publisher(TargetObservations, f'{n}/target_observations', deep)
@@ -329,7 +329,7 @@ class Client(Node):
     # -- waiting
 
     def wait_until(self, condition, seconds=DEADLINE, what='the condition'):
-        """Spin until condition() is true and return its value; fail when the time is up."""
+        """Spin until condition() is true and return its value; fail after the deadline."""
         end = time.monotonic() + seconds
         self._spinner.spin_once(timeout_sec=0)
         while True:
@@ -342,7 +342,7 @@ class Client(Node):
     def publish_in_step(self, messages, came, ahead=OBSERVATION_DEPTH // 4):
         """Publish (fluoroscope, message) pairs, never more than `ahead` ahead of came().
 
-        came(): number of messages that were answered or never will be. So none is lost in a queue.
+        came(): number of messages that were answered or never will be. No queue overflows.
         """
         for number, (name, message) in enumerate(messages):
             self.wait_until(lambda: number - came() < ahead, what='the nodes to keep up')
@@ -354,7 +354,7 @@ class Client(Node):
         return future.result()
 
     def connect(self, node, process):
-        """Wait until everything of a node that was just started is connected with the client."""
+        """Wait until all endpoints of a newly started node are connected with the client."""
 
         def connected():
             assert process.running, f'{node} ended: {process.log}'
@@ -375,10 +375,10 @@ class Client(Node):
         self.wait_until_known_to(node)
 
     def wait_until_known_to(self, node):
-        """Wait until a node has discovered all endpoints that the client has made so far.
+        """Wait until a node has discovered all endpoints that the client has created so far.
 
         Until then, messages and answers may be lost. DDS announces endpoints in the order in which
-        they are made: a node that answers a request of the newest client knows the others, too.
+        they are created: a node that answers a request of the newest client knows the others, too.
         """
         newest = self.create_client(GetParameterTypes, f'{node}/get_parameter_types')
         answers = []
@@ -409,7 +409,7 @@ class Client(Node):
     # -- topics
 
     def listen(self, topic):
-        """Collect the messages of a topic; returns the list that they are appended to."""
+        """Collect the messages of a topic; return the list to which they are appended."""
         kind, qos = TOPICS[topic.rpartition('/')[2]]
         collected = self.messages[topic] = []
         self.create_subscription(kind, topic, collected.append, qos)
@@ -452,7 +452,7 @@ class Client(Node):
     def stream(self, pairs, rate, answered=None):
         """Publish pairs of frames at a rate while the client spins, until end_stream().
 
-        .published counts them. answered(): number of pairs that have come back; the stream is
+        .published counts the pairs. answered(): number of pairs that have come back; the stream is
         never more than half a queue ahead of it, so that an overloaded machine loses nothing.
         """
         self.published = 0
@@ -474,16 +474,16 @@ class Client(Node):
     # -- services and action
 
     def expect(self, kind, service):
-        """Make the client of a service before its node is started: see wait_until_known_to()."""
+        """Create the client of a service before its node starts: see wait_until_known_to()."""
         self._callers[service] = self.create_client(kind, service)
 
     def call_async(self, kind, service, **fields):
-        """Return the future of the answer of an expected service."""
+        """Return the future of the response of an expected service."""
         self.wait_until(self._callers[service].service_is_ready, what=f'the service {service}')
         return self._callers[service].call_async(kind.Request(**fields))
 
     def call(self, kind, service, **fields):
-        """Return the answer of a service."""
+        """Return the response of a service."""
         seconds = JOB_DEADLINE if kind is Calibrate else DEADLINE
         return self.result_of(
             self.call_async(kind, service, **fields), seconds, f'the answer of {service}'
@@ -494,7 +494,7 @@ class Client(Node):
         return self._sent(self._action, SelfCalibrate.Goal(**fields))
 
     def heal(self, **fields):
-        """As goal(), of the action heal."""
+        """Do the same as goal() for the action heal."""
         return self._sent(self._heal, Heal.Goal(**fields))
 
     def _sent(self, action, goal):
@@ -512,12 +512,12 @@ class Client(Node):
 
 
 def value_of(status, key):
-    """Return the value of a key of a DiagnosticStatus, '' without it."""
+    """Return the value of a key of a DiagnosticStatus, or '' if it has no such key."""
     return next((v.value for v in status.values if v.key == key), '')
 
 
 def standing(frame, count, first=1, rate=60.0, shift=0.0, noise=0.02, start_ns=10**18):
-    """Return a stream of frames of a standing phantom; shift moves it by that many px a frame."""
+    """Return a stream of frames of a stationary phantom, shifted by shift px per frame."""
     rng = np.random.default_rng(0)
     for i in range(count):
         uv = frame.uv + rng.normal(0, noise, frame.uv.shape) + [shift * i, 0]

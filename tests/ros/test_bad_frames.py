@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Invalid frames are counted, reported in one sentence, and do not affect the next frames."""
+"""Invalid frames are counted, reported in one sentence, and do not affect later frames."""
 
 import re
 from array import array
@@ -19,7 +19,7 @@ COLLECTS = ('calibration_node',)
 
 
 def put(field, index, value):
-    """Return a change of one element of an array of a message."""
+    """Return a function that changes one element of an array of a message."""
 
     def change(message):
         getattr(message, field)[index] = value
@@ -28,7 +28,7 @@ def put(field, index, value):
 
 
 def put_all(**fields):
-    """Return a change of whole fields of a message."""
+    """Return a function that changes whole fields of a message."""
 
     def change(message):
         for name, value in fields.items():
@@ -45,7 +45,7 @@ def sigma_of(value):
     return put_all(sigma=lambda m: float64_field([0.2] * (len(m.u) - 1) + [value]))
 
 
-BAD = {  # change of the message, nodes that refuse it, what they say
+BAD = {  # change of the message, nodes that refuse it, what they report
     'lengths': (put_all(u=lambda m: m.u[:-1]), BOTH, 'target ids, but'),
     'sigma lengths': (
         put_all(sigma=float64_field([0.2, 0.3])),
@@ -72,12 +72,12 @@ ONE_POINT = {
     'NaN',
     'infinite',
     'off the image',
-}  # the correction marks the point, and corrects the others
+}  # the correction marks this point and corrects the others
 
 
 @pytest.fixture(scope='module')
 def rig(module_graph, by_command, exposures):
-    """Both nodes with a calibration, after all bad frames, each between two good ones.
+    """Both nodes with a calibration, after all bad frames, each sent between two good ones.
 
     graph.bad: frame number by fault; graph.corrected: message by frame number.
     """
@@ -157,7 +157,7 @@ def test_nodes_are_still_running_without_traceback(rig):
 
 
 def test_frames_of_other_targets_are_ignored(rig, tracking):
-    """Markers in motion are no fault: the same stream shows them after the calibration."""
+    """Moving markers are no fault: the same stream shows them after the calibration."""
     rig.client.publish(tracking['a'][0])
     status = rig.client.wait_for_status(lambda s: s.frames_received == rig.published + 1)
     assert status.frames_rejected == len(BAD)

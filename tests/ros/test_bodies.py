@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bones and joints of a knee, live: bit for bit those of the job, in all message types."""
+"""Bones and joints of a knee, live: bit for bit those of the offline job, in all message types."""
 
 from dataclasses import replace
 
@@ -24,15 +24,15 @@ from fluoro_calib_ros.simulation.rig import virtual_rig
 
 RATE_HZ = 250.0
 EXPOSURES = 90
-STEP_S = 1e-4  # of a difference quotient
-ONE_VIEW = range(30, 40)  # the tibia in one view only
-HIDDEN = range(50, 54)  # the tibia in no view
-GONE = range(70, EXPOSURES)  # again, for longer than its motion can be predicted
+STEP_S = 1e-4  # seconds; step of a difference quotient
+ONE_VIEW = range(30, 40)  # exposures with the tibia in one view only
+HIDDEN = range(50, 54)  # exposures with the tibia in no view
+GONE = range(70, EXPOSURES)  # tibia in no view, for longer than its motion can be predicted
 NEUTRAL = (1, 10)
 JOINTS = ('joint_angles', 'joint_states')
 SEEN = 'since last seen [s]'
-PAUSE_S = 0.05  # between the last exposures, more than before
-LAST_SEEN = f'{len(GONE) / RATE_HZ + (len(GONE) - 1) * PAUSE_S:.3f}'  # by the last exposure
+PAUSE_S = 0.05  # between the last exposures; longer than before
+LAST_SEEN = f'{len(GONE) / RATE_HZ + (len(GONE) - 1) * PAUSE_S:.3f}'  # at the last exposure [s]
 FORMS = (
     'body_poses',
     *JOINTS,
@@ -43,7 +43,7 @@ FORMS = (
 
 
 def knee_frames():
-    """Frames of a knee by fluoroscope, in which the tibia is not always seen."""
+    """Frames of a knee by fluoroscope, in which the tibia is not always visible."""
     knee = virtual_knee(1)
     motion = walking(knee, np.arange(EXPOSURES) / RATE_HZ)
     frames = simulate_knee(virtual_rig(1), knee, motion, seed=1).frames
@@ -64,7 +64,7 @@ def knee_frames():
 
 
 def write_files(knee, folder):
-    """Write bodies.csv and joints.toml; returns the parameters of the node."""
+    """Write bodies.csv and joints.toml; return the parameters of the node."""
     write_bodies(folder / 'bodies.csv', knee.surveyed)
     text = joint_definition(knee.joint, knee.landmarks)
     neutral = f'neutral = {list(NEUTRAL)}\n\n[joint.proximal_frame'
@@ -112,7 +112,7 @@ def live(module_graph, by_command, tmp_path_factory):
     for topic in ('reconstruction/body_poses', *(f'reconstruction/{f}' for f in JOINTS), '/tf'):
         found = client.messages[topic]
         client.wait_until(lambda found=found: len(found) == EXPOSURES, what=topic)
-    # Statuses of once a second: the last one before may be of the neutral trial.
+    # Statuses come once a second: the last one before may belong to the neutral trial.
     graph.statuses = {
         name: client.wait_for_diagnostics('reconstruction_node', lambda s: s.level == b'\0', name)
         for name in ('body femur', 'joint knee')
@@ -133,7 +133,7 @@ def live(module_graph, by_command, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def offline(live, by_command):
-    """The same exposures by the job of the command."""
+    """The same exposures processed by the command's offline job."""
     bodies = read_bodies(live.files['bodies'])
     joints = read_joints(live.files['joints'], bodies)
     calibrations = read_calibrations(by_command)
@@ -149,7 +149,7 @@ def received(live, form):
 
 
 def column(messages, name, row, width=1):
-    """Values (T, width) of a body or joint in a flat array of every message."""
+    """Return the values (T, width) of a body or joint in a flat array of every message."""
     part = slice(width * row, width * (row + 1))
     return np.array([getattr(message, name)[part] for message in messages])
 
@@ -241,7 +241,7 @@ def test_types_without_a_status_have_measured_poses_only(live):
 
 
 def test_velocities_of_the_odometry_are_those_of_the_motion(live):
-    """Along the axes of the body: they do not depend on the rig frame."""
+    """Velocities are along the axes of the body, so they do not depend on the rig frame."""
     rows = np.arange(10, ONE_VIEW.start)
     before, after = (
         walking(virtual_knee(1), rows / RATE_HZ + shift) for shift in (-STEP_S, STEP_S)
@@ -266,7 +266,7 @@ def test_velocities_of_the_odometry_are_those_of_the_motion(live):
     covariance = np.array([one.covariance for one in found]).reshape(-1, 6, 6)
     error = twist - true
     squares = np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=1)
-    assert 0.2 < np.mean(squares) / 6 < 3  # neighbouring errors are correlated: a few are free
+    assert 0.2 < np.mean(squares) / 6 < 3  # errors are correlated: few of them are independent
     assert np.abs(true).max(axis=0).min() > 0.02 and np.abs(error).max() < np.abs(true).max()
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The bridge: what Foxglove receives by its WebSocket protocol."""
+"""The bridge: what Foxglove receives over its WebSocket protocol."""
 
 import asyncio
 import json
@@ -20,7 +20,7 @@ PROTOCOL = ['foxglove.sdk.v1']
 
 
 def test_without_the_sdk_it_says_what_to_install(tmp_path, ros, monkeypatch):
-    # Ahead of the installed package on the path, as if there were none.
+    # Precedes the installed package on the path, as if that were missing.
     (tmp_path / 'foxglove.py').write_text('raise ImportError\n')
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join([str(tmp_path), *sys.path]))
     node = Process(entry_point('bridge_node'), tmp_path / 'log')
@@ -92,7 +92,7 @@ def test_only_who_knows_the_token_and_no_foreign_page_is_let_through(graph):
         with pytest.raises(InvalidStatus) as caught:
             connect(base + query, subprotocols=PROTOCOL, origin=origin)
         assert caught.value.response.status_code == 403
-    with socket_of(base) as raw:  # no request at all
+    with socket_of(base) as raw:  # send no request at all
         raw.sendall(b'x' * 100_000)
         assert not raw.recv(1000).startswith(b'HTTP/1.1 101')
     assert bridge.log.count('refused: the token is missing or wrong') == 4

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Collecting exposures: by capture, by a standing phantom, and pairing by number or by stamp."""
+"""Collecting exposures: by capture or from a stationary phantom; pairing by number or by stamp."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from ros_graph import NAMES, standing
 
 
 def pairs_of(exposures, i=0, count=10**6, **options):
-    """Return a stream of the phantom as in exposure i, moved by shift px a frame."""
+    """Return a stream of the phantom as in exposure i, moved by shift px per frame."""
     return zip(*(standing(exposures[n][i], count, **options) for n in NAMES))
 
 
@@ -30,7 +30,7 @@ def test_capture_collects_one_exposure_per_call(graph, exposures, tmp_path):
         assert f'captured, {number} exposures now' in answer.message
     several = [
         client.call_async(Capture, 'capture', timeout_sec=30.0) for _ in range(8)
-    ]  # a service holds ten
+    ]  # a service call holds ten
     client.wait_until(lambda: all(one.done() for one in several), what='the captures')
     assert sorted(one.result().exposures for one in several) == list(range(4, 12)), (
         'a frame for each'
@@ -58,7 +58,7 @@ def test_capture_needs_all_fluoroscopes_and_a_new_frame(graph, exposures, tmp_pa
         (tuple(replace(exposures[n][0], number=7) for n in NAMES) for _ in range(10**6)), 60.0
     )
     assert client.call(Capture, 'capture', timeout_sec=30.0).success
-    answer = client.call(Capture, 'capture')  # only the same frame comes
+    answer = client.call(Capture, 'capture')  # only the same frame arrives
     client.end_stream()
     assert not answer.success and answer.message == 'frame 7 is collected already'
     answer = client.call(Capture, 'capture', timeout_sec=-1.0)
@@ -77,7 +77,7 @@ def test_standing_phantom_gives_one_exposure_and_a_moving_one_none(graph, exposu
                 exposures, count=count, first=sent + 1, start_ns=10**18 + sent * 10**9, **options
             ),
             200,
-        )  # what counts is the stamps
+        )  # only the stamps count
         client.wait_until(
             lambda: client.published == count, what=f'{count} frames to be published'
         )
@@ -88,8 +88,8 @@ def test_standing_phantom_gives_one_exposure_and_a_moving_one_none(graph, exposu
         ).exposures
 
     assert stream(60) == 1, 'stands'
-    # The first frame counts as a single shot where none has come in the time before: let it be the
-    # known pose
+    # The first frame counts as a single shot if none has arrived in the preceding time, so make it
+    # the known pose
     assert stream(60, shift=3.0) == 1, 'moves'
     assert stream(60, i=1) == 2, 'stands in a new pose'
     assert stream(30, i=1) == 2 and stream(30) == 2, 'stands where it has stood'
@@ -103,7 +103,7 @@ def test_simulated_phantom_is_collected_automatically(graph, tmp_path):
         lambda s: s.exposures >= 3, what='three exposures of the virtual rig'
     )
     assert status.frames_rejected == 0 and status.observations > 3 * 120
-    # no more than one in every turn of 0.8 s, and one on the way where it begins
+    # at most one per turn of 0.8 s, plus one that is already on its way at the start
     assert status.exposures <= status.frames_received / (0.8 * 60) + 2
 
 
@@ -111,7 +111,7 @@ def test_frames_without_partner_are_counted_and_reported(graph, exposures, tmp_p
     client = graph.client
     graph.calibration_node(tmp_path / 'none')
     for frame in standing(exposures['a'][0], 80):
-        client.publish(frame)  # nothing of b: 64 wait, the others are given up
+        client.publish(frame)  # nothing of b: 64 frames wait, the others are dropped
     client.wait_for_status(lambda s: s.frames_received == 80)
     assert client.wait_for_status(lambda s: s.frames_unpaired == 16).exposures == 0
     status = client.wait_for_diagnostics(
@@ -125,9 +125,7 @@ def test_frames_without_partner_are_counted_and_reported(graph, exposures, tmp_p
 def test_pairing_by_stamp(graph, exposures, tmp_path):
     client = graph.client
     graph.calibration_node(tmp_path / 'none', pair_by='stamp', pair_tolerance=0.002)
-    for a, b in list(zip(*exposures.values()))[
-        :5
-    ]:  # numbers that have nothing to do with each other
+    for a, b in list(zip(*exposures.values()))[:5]:  # unrelated frame numbers
         client.publish(replace(a, number=0))
         client.publish(replace(b, number=1000 - b.number, stamp_ns=b.stamp_ns + 1_500_000))
     status = client.wait_for_status(lambda s: s.exposures == 5)
@@ -135,6 +133,6 @@ def test_pairing_by_stamp(graph, exposures, tmp_path):
     a = exposures['a'][5]
     b = exposures['b'][5]
     client.publish(a)
-    client.publish(replace(b, stamp_ns=b.stamp_ns + 2_500_000))  # too far apart
+    client.publish(replace(b, stamp_ns=b.stamp_ns + 2_500_000))  # too far apart in time
     client.wait_for_status(lambda s: s.frames_received == 6)
     assert client.wait_for_status(lambda s: s.frames_received == 6, 'b').exposures == 5

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A stream in which every tenth message is damaged: all good ones are corrected, the others
-counted.
+"""A stream in which every tenth message is damaged: the nodes correct all good messages and count
+the damaged ones.
 """
 
 import itertools
@@ -54,13 +54,13 @@ KINDS = {
     'NaN': no_number,
     'off': off_the_image,
 }
-ONE_POINT = ('NaN', 'off')  # of these frames the other points are corrected
+ONE_POINT = ('NaN', 'off')  # the other points of these frames are corrected
 COUNT = 1600
 
 
 @pytest.fixture(scope='module')
 def stream(module_graph, by_command, tracking):
-    """1,600 messages of each fluoroscope, every tenth of a damaged in one of several ways."""
+    """1,600 messages of each fluoroscope; every tenth message of a is damaged in some way."""
     graph = module_graph
     client = module_graph.client
     graph.nodes = graph.whole_chain(by_command)
@@ -139,6 +139,6 @@ def test_nodes_are_still_running_without_traceback(stream):
 
 
 def test_truncated_bytes_cannot_be_decoded_by_rclpy(tracking):
-    """The damage of this test is real: rclpy cannot decode the bytes."""
+    """The damage is real: rclpy cannot decode the bytes."""
     with pytest.raises(Exception):  # noqa: B017 the type depends on the middleware
         deserialize_message(message_of(tracking['a'][0], 1, 'undecodable'), TargetObservations)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Nodes whose disk is full, for real."""
+"""Nodes on a disk that is really full."""
 
 import shutil
 
@@ -24,7 +24,7 @@ def disk(tmp_path):
 def test_calibration_is_used_and_the_saved_one_kept_where_the_disk_is_full(
     graph, disk, by_command, exposures
 ):
-    """Told before the job where nothing at all can be written, else in the answer."""
+    """A disk with no space at all is reported before the job, any other shortage in the answer."""
     client = graph.client
     folder = disk.path / 'calibrations'
     shutil.copytree(by_command, folder)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""SIGINT in the middle of work that takes long: nodes do not wait for it."""
+"""SIGINT during long computations: nodes do not wait for them to finish."""
 
 import signal
 import subprocess
@@ -19,9 +19,9 @@ from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
-SIDE = 8192  # px; the preparation of this calibration takes a minute
+SIDE = 8192  # px; preparing this calibration takes a minute
 POINTS = 200_000
-END_S = 30  # a tenth of it on an idle machine
+END_S = 30  # a tenth of it suffices on an idle machine
 BUSY = """
 import threading
 from rclpy.node import Node
@@ -44,7 +44,7 @@ run(Busy)
 
 @pytest.fixture(scope='module')
 def costly():
-    """Message of a calibration within all limits."""
+    """Return a calibration message within all limits."""
     uv = np.random.default_rng(1).uniform(0, SIDE - 1, (POINTS, 2))
     small = calibrated('a', 5, model='none').calibrations['a']
     return message_from_calibration(
@@ -71,7 +71,7 @@ def test_node_ends_while_a_calibration_is_prepared(graph, costly, node):
 
 
 def test_node_that_does_not_end_is_ended(ros):
-    """Whatever its main thread does."""
+    """The node ends whatever its main thread does."""
     command = [sys.executable, '-c', BUSY]
     with subprocess.Popen(command, stdout=PIPE, stderr=PIPE, text=True, cwd=ROOT) as node:
         assert node.stdout.readline() == 'at work\n'

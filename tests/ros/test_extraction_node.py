@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The extraction node: observations as by the command, bad images counted, overlay, lifecycle."""
+"""The extraction node: observations as by the command, bad images counted, overlay, states."""
 
 from array import array
 
@@ -42,7 +42,7 @@ MODEL = 'collocation'
 
 
 def picture(name, number, beads=BEADS, dtype=np.uint8):
-    """Image of the phantom in one of its poses, from the side of a fluoroscope."""
+    """Return an image of the phantom in one of its poses, as seen by a fluoroscope."""
     pose = matrix_from_vector([0.5 * np.sin(number), 0.4 * np.cos(2 * number), 0.9 * number])
     side = matrix_from_vector([0, 0.7 if name == 'a' else -0.7, 0])
     x = beads @ pose.T @ side.T + (5 * np.sin(3 * number), 5 * np.cos(number), 900)
@@ -76,7 +76,7 @@ def compressed(data, number):
 
 @pytest.fixture(scope='module')
 def rig(module_graph, tmp_path_factory):
-    """Extraction and calibration node of a small rig, and what they are shown."""
+    """Extraction and calibration nodes of a small rig, with the images that they receive."""
     folder = tmp_path_factory.mktemp('rig')
     phantom = folder / 'phantom.csv'
     write_phantom(phantom, Phantom(np.arange(48) + 1, BEADS, np.full(48, 0.05)))
@@ -103,7 +103,7 @@ def rig(module_graph, tmp_path_factory):
     client.wait_until(
         lambda: all(p.get_subscription_count() for p in publishers.values()), what='the readers'
     )
-    for name in NAMES:  # the client, and the calibration node
+    for name in NAMES:  # one reader is the client, the other the calibration node
         wait_for(client, lambda values, _: int(values.get('readers', 0)) == 2, name, 'readers')
     client.node = nodes[0]
     client.folder = folder
@@ -126,7 +126,7 @@ def wait_for(client, condition, name='a', what='a diagnostic'):
 
 @pytest.fixture(scope='module')
 def observed(rig):
-    """Observations of the node by fluoroscope and number."""
+    """Observations of the node, by fluoroscope and number."""
     for number in range(1, POSES + 1):
         for name in NAMES:
             rig.images[name].publish(raw(picture(name, number), number, name))
@@ -139,7 +139,7 @@ def observed(rig):
 
 @pytest.fixture(scope='module')
 def frames_by_command(rig):
-    """Frames of the command extract by fluoroscope."""
+    """Frames of the command extract, by fluoroscope."""
     out = {}
     for name in NAMES:
         folder = rig.folder / name
@@ -165,7 +165,7 @@ def test_observations_are_those_of_the_command(observed, frames_by_command):
 
 
 def test_calibration_is_that_of_the_command(rig, observed, frames_by_command):
-    """The calibration node has collected the exposures, without any change."""
+    """The calibration node has collected the exposures unchanged."""
     rig.wait_for_status(lambda s: s.exposures == POSES, what='the exposures')
     answer = rig.call(Calibrate, 'calibrate')
     assert answer.success, answer.message
@@ -178,7 +178,7 @@ def test_calibration_is_that_of_the_command(rig, observed, frames_by_command):
         assert answer.observations[f] == sum(len(f.target_id) for f in frames_by_command[name])
     folder = rig.folder / 'calibrations'
     for name in NAMES:
-        # The node may discover the reader of radiographs after the first image.
+        # The node may discover the reader of radiographs only after the first image.
         for number in range(2, POSES + 1):
             radiograph = decode((folder / RADIOGRAPHS / f'{name}_{number}.jpg').read_bytes())
             shown = picture(name, number).astype(float)
@@ -188,7 +188,7 @@ def test_calibration_is_that_of_the_command(rig, observed, frames_by_command):
     assert report.count('"/9j/') >= len(NAMES) * (POSES - 1)
 
 
-BAD = {  # number of the image, publisher, message, key of the diagnostics, what is said
+BAD = {  # number of the image, publisher, message, diagnostics key, reported text
     'garbage': (
         'compressed',
         lambda n: compressed(b'no image' * 50, n),
@@ -272,10 +272,10 @@ def test_overlay_is_drawn_for_subscribers_only(rig, observed):
     overlay = pictures[0]
     assert overlay.encoding == 'bgr8' and overlay.width >= SIZE and overlay.height >= SIZE
     pixels = np.frombuffer(overlay.data, np.uint8).reshape(overlay.height, overlay.width, 3)
-    assert (pixels[..., 0] != pixels[..., 2]).any()  # circles in colour
+    assert (pixels[..., 0] != pixels[..., 2]).any()  # coloured circles
 
     def followed(values, status):
-        came()  # the first image of a pose is searched, and the overlay may be of that one
+        came()  # the first image of a pose needs a search, and the overlay may show that image
         return int(values['images followed']) > 0
 
     values = wait_for(rig, followed)
@@ -304,7 +304,7 @@ def test_inactive_node_receives_no_images_and_starts_anew(rig, observed):
 
 
 def test_markers_of_the_simulator_are_followed(graph):
-    """Radiographs of the simulator; ids and first places from a table."""
+    """Radiographs of the simulator; ids and initial positions from a table."""
     rate = 0.5
     tracking = simulate_tracking(virtual_rig(1, names=('a',)), 4.0, rate, 1, 0.0)
     markers = graph.directory / 'markers.csv'
@@ -326,8 +326,8 @@ def test_markers_of_the_simulator_are_followed(graph):
 
 
 def test_markers_are_followed_in_both_views_together(graph, calibrated):
-    """With the calibrations of both fluoroscopes; a missing view of an exposure is no obstacle."""
-    rate = 0.2  # a busy machine renders a view in seconds; one that is an exposure late is lost
+    """Uses the calibrations of both fluoroscopes; an exposure may lack one view."""
+    rate = 0.2  # a busy machine renders a view in seconds; a view one exposure late is lost
     tracking = simulate_tracking(virtual_rig(1), 6.0, rate, 1, 0.0)
     markers = graph.directory / 'markers.csv'
     write_observations_csv(markers, {name: tracking.frames[name][:1] for name in NAMES})
@@ -348,7 +348,7 @@ def test_markers_are_followed_in_both_views_together(graph, calibrated):
 
 
 def test_bodies_give_the_ids_of_the_first_markers(graph, calibrated):
-    """Without first places: the shapes of the bodies alone, in whatever pose."""
+    """No initial positions: the shapes of the bodies suffice, in any pose."""
     rate = 0.2
     tracking = simulate_tracking(virtual_rig(1), 6.0, rate, 1, 0.0)
     bodies = graph.directory / 'bodies.csv'

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages of other programs, and bugs that a message brings to light: neither ends a node."""
+"""Messages of other programs, and bugs that a message triggers: neither ends a node."""
 
 import time
 from dataclasses import replace
@@ -28,7 +28,7 @@ def drift_observations(status):
 def test_camera_info_of_another_camera_does_not_restart_the_drift_watch(
     graph, by_command, tracking
 ):
-    """It is named, and the watch goes on with what it has seen."""
+    """The other camera is named, and the watch keeps its previous observations."""
     client = graph.client
     node = graph.whole_chain(by_command)['reconstruction_node']
     points = client.listen('reconstruction/points_with_covariance')
@@ -69,7 +69,7 @@ def test_camera_info_of_another_camera_does_not_restart_the_drift_watch(
 
 
 def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):
-    """As the driver of an uncalibrated camera publishes it, on a topic of the same name."""
+    """The driver of an uncalibrated camera publishes such messages on a topic of the same name."""
     client = graph.client
     foreign = client.create_publisher(CameraInfo, 'a/camera_info', latched_qos())
     foreign.publish(CameraInfo())
@@ -86,7 +86,7 @@ def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):
     client.wait_until_known_to('reconstruction_node')
 
     def warned(info, text):
-        foreign.publish(info)  # again: that of the correction node may take its place
+        foreign.publish(info)  # publish again: the message of the correction node may replace it
         return text in node.log
 
     client.wait_until(lambda: warned(CameraInfo(), 'size is 0 x 0 px'), what='the first warning')
@@ -141,7 +141,7 @@ def test_qos_override_of_one_topic_leaves_the_others_alone(graph, end):
 
 
 def test_an_exception_in_a_callback_costs_one_frame(ros, monkeypatch, tracking):
-    """A bug: the frame is lost, counted and reported, and the node goes on."""
+    """A bug in a callback: the frame is lost, counted and reported, and the node continues."""
     original = CorrectionNode._on_frame
 
     def with_bug(self, name, frame, info):
@@ -164,7 +164,7 @@ def test_an_exception_in_a_callback_costs_one_frame(ros, monkeypatch, tracking):
             output.publish(message_from_frame(replace(tracking['a'][0], number=number)))
 
         def first_received():
-            publish(12)  # lost as long as the reader does not know the publisher
+            publish(12)  # lost until the reader discovers the publisher
             return stream.waiting
 
         wait_until(client, first_received)

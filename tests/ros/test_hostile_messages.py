@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages of hostile peers: a flood, contents that were changed, and names with line ends."""
+"""Messages of hostile peers: a flood, manipulated contents, and names with line breaks."""
 
 import re
 import sys
@@ -22,8 +22,8 @@ from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 FRAMES = 100
-LARGE = 10  # messages of the flood that are seen to be shed
-MEMORY_KB = 700_000  # of the node; the large messages of its queue alone would take 240 MB
+LARGE = 10  # messages of the flood whose shedding is checked
+MEMORY_KB = 700_000  # limit for the node; the large messages of its queue alone would take 240 MB
 FORGED = '\n[FATAL] [1.0] [rig.correction_node]: forged\x1b[2J'
 
 
@@ -42,7 +42,7 @@ def chain(module_graph, by_command):
 
 
 def memory_kb(process):
-    """Largest resident memory that a process has had."""
+    """Return the peak resident memory of a process."""
     status = Path(f'/proc/{process.pid}/status').read_text()
     return int(re.search(r'VmHWM:\s*(\d+) kB', status)[1])
 
@@ -65,7 +65,7 @@ def test_names_cannot_forge_lines_of_the_log(chain, tracking):
 
 
 def allowed(node):
-    """Names that the policy allows a node, by kind of access: 'publish', 'reply', ..."""
+    """Return the names that the policy allows a node, by kind: 'publish', 'reply', ..."""
     policy = ElementTree.parse(ROOT / 'config' / 'sros2_policy.xml')
     profile = policy.find(f".//profile[@node='{node}']")
     found = {}
@@ -77,7 +77,7 @@ def allowed(node):
 
 @pytest.mark.parametrize('node', ['calibration_node', 'correction_node', 'reconstruction_node'])
 def test_policy_of_sros2_covers_the_graph(chain, node):
-    """All endpoints of the running nodes, and no calibration by any other than its node."""
+    """All endpoints of the running nodes are covered; only the calibration node may calibrate."""
     client = chain.client
     namespace = client.get_namespace()
     policy = allowed(node)
@@ -96,7 +96,7 @@ def test_policy_of_sros2_covers_the_graph(chain, node):
 
 
 def test_points_without_sigma_meet_the_limit_at_the_first_node(chain):
-    """20,000 are allowed; their bytes would allow 40,000, and the corrected ones not."""
+    """The limit is 20,000 points; by size in bytes 40,000 would pass, but not once corrected."""
     client = chain.client
     count = 30_000
     uv = np.random.default_rng(2).uniform(0, 1000, (count, 2))
@@ -177,7 +177,7 @@ def test_changed_orientation_under_its_id_is_refused(chain):
 
 
 def test_stream_goes_on_beside_a_hostile_calibration(chain, tracking):
-    """Of 200,000 training points on 4 square pixels; its grid took minutes."""
+    """The calibration has 200,000 training points on 4 square pixels; its grid took minutes."""
     client = chain.client
     node = chain.nodes['correction_node']
     count = 200_000

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Requests of any peer that a node cannot handle: it refuses them, and goes on."""
+"""Requests that a node cannot handle, from any peer: the node refuses them and continues."""
 
 from functools import partial
 from pathlib import Path
@@ -59,7 +59,7 @@ def client(module_graph, tmp_path_factory):
 @pytest.mark.parametrize('node', [*MANAGED, *OTHERS])
 def test_parameter_of_unknown_type_is_refused(client, node):
     wrong = Parameter(name='fluoroscopes', value=ParameterValue(type=99))
-    for _ in range(2):  # the second answer shows that the node has survived the first
+    for _ in range(2):  # the second answer shows that the node has survived the first request
         found = client.call(SetParameters, f'{node}/set_parameters', parameters=[wrong, wrong])
         assert [one.successful for one in found.results] == [False, False]
         assert '99' in found.results[0].reason

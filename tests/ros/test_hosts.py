@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The graph on several hosts, each a network namespace with an address of its own."""
+"""The graph on several hosts, each a network namespace with its own address."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ LOSSY = Quality(loss=0.02, delay_s=0.005)
 
 
 def obstacle_to_namespaces() -> str:
-    """Return why this machine makes no namespaces with devices, '' where it does."""
+    """Return why this machine cannot create namespaces with devices, or '' if it can."""
     name = f'fluoro-probe-{os.getpid()}'
     try:
         os.close(os.open('/dev/net/tun', os.O_RDWR))
@@ -34,7 +34,7 @@ def obstacle_to_namespaces() -> str:
 
 @pytest.fixture
 def network(ros):
-    """Hosts of their own; what they exchange passes through a switch that counts."""
+    """Hosts whose traffic passes through a switch that counts frames."""
     obstacle = obstacle_to_namespaces()
     if obstacle:
         pytest.skip(f'network namespaces cannot be made here: {obstacle}')
@@ -43,7 +43,7 @@ def network(ros):
 
 
 def test_graph_on_several_hosts(network, tmp_path):
-    """It calibrates, corrects and reconstructs; over bad links and after a cut, too."""
+    """The graph calibrates, corrects and reconstructs, also over bad links and after a cut."""
     with Hosts(network, tmp_path) as hosts:
         client = hosts.start_graph(BAGS / 'phantom.csv')
         hosts.play(BAGS / 'calibration', readers=3, rate=10.0)

@@ -34,12 +34,12 @@ DEPTHS = {'mono8': np.uint8, 'mono16': np.uint16}
 
 @pytest.fixture(scope='module')
 def pictures(exposures):
-    """Images of the phantom in fluoroscope a by encoding."""
+    """Images of the phantom in fluoroscope a, by encoding."""
     return {name: bead_image(exposures['a'][0].uv, SIZE, dtype) for name, dtype in DEPTHS.items()}
 
 
 class Eyes:
-    """What a client shows to the image node and receives from it, of fluoroscope a."""
+    """What a client sends to the image node and receives from it, for fluoroscope a."""
 
     def __init__(self, graph):
         self.client = graph.client
@@ -50,7 +50,7 @@ class Eyes:
         )
         self.images = []
         self.infos = []
-        self.beside = []  # where image_transport looks for the CameraInfo
+        self.beside = []  # CameraInfo on the topic where image_transport looks for it
         self.small = []
         self.client.create_subscription(
             Image, 'a/image_corrected', self.images.append, images_qos()
@@ -58,7 +58,7 @@ class Eyes:
         self.client.create_subscription(
             CameraInfo, 'a/image_corrected/camera_info', self.infos.append, images_qos()
         )
-        # As a CameraSubscriber asks for it.
+        # With the quality of service that a CameraSubscriber requests.
         self.client.create_subscription(
             CameraInfo, 'a/camera_info', self.beside.append, qos_profile_sensor_data
         )
@@ -73,7 +73,7 @@ class Eyes:
         )
 
     def stamped(self, message):
-        """Set a unique stamp of a message and return it, too."""
+        """Give a message a unique stamp and return the message."""
         self.number += 1
         message.header.stamp = stamp_from_nanoseconds(10**18 + self.number)
         message.header.frame_id = 'a_optical'
@@ -92,7 +92,7 @@ class Eyes:
         )
 
     def answer(self, publisher, message):
-        """Return the Image and CameraInfo that answer a message."""
+        """Return the Image and CameraInfo that the node publishes for a message."""
         publisher.publish(message)
         stamp = message.header.stamp
         found = [None, None]
@@ -144,7 +144,7 @@ def eyes(module_graph, by_command):
     return eyes
 
 
-# ---- good ones
+# ---- valid images
 
 
 @pytest.mark.parametrize('encoding', DEPTHS)
@@ -179,7 +179,7 @@ def test_image_is_corrected_as_by_the_corrector(eyes, pictures, encoding, kind):
 
 
 def test_images_are_compressed_for_subscribers_only(eyes, pictures):
-    """Only while there are subscribers; by format and depth of the pixels."""
+    """The node compresses only while there are subscribers, by format and depth of the pixels."""
     assert eyes.diagnostics(lambda v, _: True)['images compressed'] == '0'
     small = eyes.small
     eyes.client.create_subscription(
@@ -206,11 +206,11 @@ def test_images_are_compressed_for_subscribers_only(eyes, pictures):
         assert np.array_equal(decode(small[-1].data), eyes.corrector.correct(pictures[encoding]))
 
 
-# ---- bad ones
+# ---- invalid images
 
 
 def changed(**fields):
-    """Return a change of fields of an Image message."""
+    """Return a function that changes fields of an Image message."""
 
     def change(message):
         for name, value in fields.items():
@@ -225,7 +225,7 @@ def of_array(image):
     return array('B', cv2.imencode('.png', image)[1].tobytes())
 
 
-BAD = {  # change of the message, kind, what is said
+BAD = {  # change of the message, kind, what is reported
     'colours': (changed(encoding='rgb8'), 'encoding', "encoding 'rgb8' is not mono8 or mono16"),
     'no encoding': (changed(encoding=''), 'encoding', "encoding '' is not"),
     'another size': (
@@ -277,7 +277,7 @@ BAD_COMPRESSED = {
 
 @pytest.fixture(scope='module')
 def after_bad_ones(eyes):
-    """The eyes after all bad images, each followed by a good one."""
+    """The eyes after all invalid images, each followed by a valid one."""
     for change, _, _ in BAD.values():
         message = change(eyes.message(GREY))
         eyes.raw.publish(message)
@@ -291,7 +291,7 @@ def after_bad_ones(eyes):
         (eyes.raw, eyes.message(GREY)),
         (eyes.compressed, eyes.stamped(CompressedImage(format='png', data=of_array(GREY)))),
     ):
-        publisher.publish(serialize_message(message)[:500])  # what is no message at all
+        publisher.publish(serialize_message(message)[:500])  # truncated: not a valid message
         eyes.answer(publisher, eyes.message(GREY) if publisher is eyes.raw else message)
     return eyes
 
@@ -320,7 +320,7 @@ def test_bad_images_are_counted_by_kind(after_bad_ones):
 
 
 def test_lifecycle(after_bad_ones, pictures):
-    """An inactive node corrects nothing; configured again it receives the latched calibration."""
+    """An inactive node corrects nothing; reconfigured, it receives the latched calibration."""
     eyes = after_bad_ones
     image = pictures['mono8']
 
@@ -349,7 +349,7 @@ def test_lifecycle(after_bad_ones, pictures):
 
 
 def test_calibrations_change_between_two_images(graph, by_command, pictures):
-    """Every image is corrected with one calibration; an invalid calibration changes nothing."""
+    """Each image is corrected with one calibration; an invalid calibration changes nothing."""
     graph.start('image_node', {'fluoroscopes': '[a]'})
     eyes = Eyes(graph)
     image = pictures['mono8']
@@ -378,12 +378,12 @@ def test_calibrations_change_between_two_images(graph, by_command, pictures):
     values = eyes.diagnostics(lambda v, _: 'does not match its id' in v['last fault'])
     eyes.client.destroy_timer(stream)
     assert values['calibration'] == second.calibration_id
-    came = [results.index(message.data.tobytes()) for message in eyes.images]  # it is one of them
+    came = [results.index(message.data.tobytes()) for message in eyes.images]  # raises if no match
     assert came == sorted(came) and set(came) == {0, 1}
 
 
 def test_invalid_parameters_are_refused(graph):
-    """The node does not start, and gives the reason."""
+    """The node does not start and gives the reason."""
     wrong = {
         'interpolation': ('nearest', 'parameter interpolation is one of linear, cubic'),
         'inputs': ('none', 'parameter inputs is one of raw, compressed, both'),

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an integrator meets: saved calibrations, two nodes by mistake, remapped inputs, TF."""
+"""Issues that integrators meet: saved calibrations, duplicate nodes, remapped inputs, TF."""
 
 import os
 import select
@@ -20,7 +20,7 @@ from fluoro_calib_ros.io.phantom import read_phantom
 
 
 def ids_in_use(client, node='correction_node'):
-    """Return the calibration in use by fluoroscope, as the diagnostics have it."""
+    """Return the calibration in use by fluoroscope, as the diagnostics state it."""
     return {
         name: value_of(client.statuses[f'{node}: {name}'], 'calibration')
         for name in NAMES
@@ -37,7 +37,7 @@ def ids_of(folder):
 
 
 def save_other_calibrations(exposures, folder):
-    """Save calibrations of the same rig by another model."""
+    """Save calibrations of the same rig with another model."""
     job = calibrate(exposures, read_phantom(BAGS / 'phantom.csv'), CalibrationOptions('none'))
     for calibration in job.calibrations.values():
         save_calibration(folder, calibration)
@@ -62,7 +62,7 @@ def test_streams_are_corrected_without_a_calibration_node(graph, calibrated, exp
 
 
 def test_folder_without_calibrations_is_named_and_waited_for(graph, tmp_path):
-    """Before the first calibration this is no fault: the log names the folder."""
+    """A missing first calibration is no fault: the log names the folder."""
     node = graph.start('correction_node', {'calibration_directory': tmp_path})
     status = graph.client.wait_for_diagnostics(
         'correction_node', lambda s: 'no calibration yet' in s.message
@@ -83,7 +83,7 @@ def test_calibration_node_without_phantom_serves_saved_calibrations(graph, calib
 
 
 def test_calibrations_of_another_phantom_are_not_taken_up(graph, calibrated, tmp_path):
-    """Unless the service asks for it."""
+    """They are taken up only if the service asks for it."""
     client = graph.client
     phantom = tmp_path / 'other.csv'
     lines = (BAGS / 'phantom.csv').read_text().splitlines()
@@ -96,7 +96,7 @@ def test_calibrations_of_another_phantom_are_not_taken_up(graph, calibrated, tmp
 
 
 def test_every_namespace_has_its_own_folder(graph, by_command, tmp_path, monkeypatch):
-    """Below ROS_HOME, where that is set."""
+    """The folders are below ROS_HOME where that is set."""
     monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
     folder = tmp_path / 'home' / 'fluoro_calib' / graph.namespace.strip('/')
     shutil.copytree(by_command, folder)
@@ -107,7 +107,7 @@ def test_every_namespace_has_its_own_folder(graph, by_command, tmp_path, monkeyp
 
 
 def test_two_calibration_nodes_of_a_rig_are_reported(graph, calibrated, exposures, tmp_path):
-    """No calibration is taken over until one of them has ended."""
+    """No calibration is accepted until one of the nodes has ended."""
     client = graph.client
     other = save_other_calibrations(exposures, tmp_path / 'other')
     first = graph.calibration_node(calibrated)
@@ -131,7 +131,7 @@ def test_two_calibration_nodes_of_a_rig_are_reported(graph, calibrated, exposure
 
 
 def test_remapped_inputs_count_as_published(graph, calibrated, exposures):
-    """No warning that nobody publishes while frames are corrected."""
+    """There is no warning about missing publishers while frames are corrected."""
     client = graph.client
     graph.calibration_node(calibrated)
     graph.start(
@@ -144,7 +144,7 @@ def test_remapped_inputs_count_as_published(graph, calibrated, exposures):
 
 
 def test_tf_has_one_root_whatever_the_source_of_the_orientation(graph, calibrated, exposures):
-    """Orientation by the calibration, then by a capture: the same parent, nothing outdated."""
+    """Orientation from the calibration, then from a capture: same parent, nothing outdated."""
     client = graph.client
     client.listen('/tf_static')
     graph.whole_chain(calibrated)
@@ -165,7 +165,7 @@ def test_tf_has_one_root_whatever_the_source_of_the_orientation(graph, calibrate
 
 
 def test_job_ends_with_its_killed_node(tmp_path):
-    """The worker process cannot be terminated by a node that was killed with SIGKILL."""
+    """A node that was killed with SIGKILL cannot terminate its worker process."""
     program = f"""
 import sys
 sys.path.insert(0, {str(ROOT / 'tests')!r})
@@ -188,7 +188,7 @@ if __name__ == '__main__':
     with subprocess.Popen(
         [sys.executable, script], cwd=ROOT, stdout=subprocess.PIPE, text=True
     ) as node:
-        worker = os.pidfd_open(int(node.stdout.readline()))  # readable once it has ended
+        worker = os.pidfd_open(int(node.stdout.readline()))  # readable once the worker has ended
         os.kill(node.pid, signal.SIGKILL)
         ended, _, _ = select.select([worker], [], [], 10)
         os.close(worker)

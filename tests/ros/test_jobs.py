@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A self-calibration in parallel to the stream; cancelled or refused it changes nothing."""
+"""A self-calibration in parallel with the stream; if cancelled or refused, it changes nothing."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ class Rig:
     def __init__(self, graph, folder, exposures):
         self.folder = folder
         self.client = graph.client
-        # A queue for a machine that is too busy for the rate.
+        # Deep enough for a machine that is too busy to keep up with the rate.
         graph.both_nodes(
             folder,
             **{
@@ -39,7 +39,7 @@ class Rig:
             )
 
     def collect(self, exposures):
-        """Publish exposures, and wait until all are collected."""
+        """Publish exposures and wait until all are collected."""
         before = self.client.status().exposures if self.client.status() else 0
         pairs = list(zip(*exposures.values()))
         for pair in pairs:
@@ -53,7 +53,7 @@ class Rig:
         return {n: self.client.messages[f'{n}/{topic}'] for n in NAMES}
 
     def state(self):
-        """Return all that a job may change: files, and published calibrations."""
+        """Return everything that a job may change: files and published calibrations."""
         files = {path.name: path.read_bytes() for path in self.folder.iterdir()}
         return files, {n: len(m) for n, m in self.messages('calibration').items()}
 
@@ -80,8 +80,8 @@ def test_stream_continues_while_a_job_runs(rig, exposures):
         return min(len(corrected[n]) - before[n] for n in NAMES)
 
     def taken():
-        """As came, but no more than some seconds ahead of what the calibration node has told that
-        it took.
+        """Count as came does, but stay at most some seconds ahead of the number of frames that the
+        calibration node has reported as received.
         """
         return min(came(), client.status().frames_received - received + round(2 * rate))
 
@@ -133,7 +133,7 @@ def test_cancelled_job_changes_nothing_and_the_next_one_works(rig):
         lambda s: s.state == CalibrationStatus.CALIBRATED, what='the end of the job in the status'
     )
 
-    handle = client.goal(model='none', fluoroscopes=['b'])  # no correction: one round, quick
+    handle = client.goal(model='none', fluoroscopes=['b'])  # no correction: a single, quick round
     assert client.result_of(handle.get_result_async()).status == SUCCEEDED
     files, published = rig.state()
     assert (
@@ -210,7 +210,7 @@ def test_exposures_of_one_pose_are_refused(rig, exposures):
     client.call(Reset, 'reset')
     client.wait_for_status(lambda s: s.exposures == 0)
     client.stream(zip(*(standing(exposures[n][0], 10**6) for n in NAMES)), 30.0)
-    for _ in range(4):  # by itself the node takes a pose only once
+    for _ in range(4):  # the node collects a pose by itself only once
         assert client.call(Capture, 'capture', timeout_sec=30.0).success
     client.end_stream()
     answer = client.call(Calibrate, 'calibrate')
@@ -224,7 +224,7 @@ def test_exposures_of_one_pose_are_refused(rig, exposures):
 
 
 def test_unwritable_folder_is_noticed_before_the_job(graph):
-    """And before anything that is missing for the job itself."""
+    """It is also reported before anything that the job itself lacks."""
     graph.calibration_node('/proc/calibrations')
     graph.client.expect(Calibrate, 'calibrate')
     answer = graph.client.call(Calibrate, 'calibrate')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The published calibration: latched, loaded after a restart, and used in mid-stream."""
+"""The published calibration is latched, reloaded after a restart, and replaced in mid-stream."""
 
 import itertools
 import shutil
@@ -21,7 +21,7 @@ def ids_in(folder):
 def test_late_joiner_and_restart(graph, calibrated):
     client = graph.client
     ids = ids_in(calibrated)
-    for _ in range(2):  # the second time it is a new node
+    for _ in range(2):  # the second pass uses a new node
         node = graph.calibration_node(calibrated)
         for name in NAMES:
             late = client.listen(f'{name}/calibration')
@@ -88,7 +88,7 @@ def test_correction_before_and_after_a_calibration_in_mid_stream(
         for i in itertools.count()
     )
 
-    for pair in itertools.islice(pairs, 10):  # there is no calibration
+    for pair in itertools.islice(pairs, 10):  # there is no calibration yet
         client.publish(pair[0])
     status = client.wait_for_diagnostics('correction_node', lambda s: '10 frames' in s.message)
     assert (
@@ -99,7 +99,7 @@ def test_correction_before_and_after_a_calibration_in_mid_stream(
 
     graph.calibration_node(calibrated, any_directory='true')
     client.wait_for_diagnostics('correction_node', lambda s: first in [v.value for v in s.values])
-    client.stream(pairs, 100.0, lambda: len(corrected))  # the calibration changes somewhere in it
+    client.stream(pairs, 100.0, lambda: len(corrected))  # the calibration changes within it
     client.wait_until(
         lambda: len(corrected) > 20, what='frames corrected with the first calibration'
     )

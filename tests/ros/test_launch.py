@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The shipped launch files on real launch, where that is installed: tests/ros/launch/."""
+"""The shipped launch files on real ROS launch, where it is installed: tests/ros/launch/."""
 
 import os
 import re
@@ -26,7 +26,7 @@ sys.exit(service.run())
 
 @pytest.fixture
 def run(ros, tmp_path, monkeypatch):
-    """Return a function that runs Python with the modules of tests/ros/launch/."""
+    """Return a function that runs Python with the modules of tests/ros/launch/ on its path."""
     for module in ('launch_ros', 'launch_testing'):
         pytest.importorskip(module, reason=f'{module} is not installed: it has no wheel')
     paths = f'{FOLDER}{os.pathsep}{ROOT}'

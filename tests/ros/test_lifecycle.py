@@ -24,7 +24,7 @@ NODES = ('correction_node', 'reconstruction_node', 'image_node')
 
 
 def expect(client, node):
-    """Make the service clients of a node before it is started."""
+    """Create the service clients of a node before it starts."""
     for kind, service in (
         (ChangeState, 'change_state'),
         (GetState, 'get_state'),
@@ -54,13 +54,13 @@ def test_node_processes_frames_only_while_active(graph, by_command, tracking):
     assert state(client, 'correction_node') == State.PRIMARY_STATE_UNCONFIGURED
     assert not client.count_publishers('a/corrected_observations')
     frame = tracking['a'][0]
-    for turn in range(2):  # the second time after it was taken down altogether
+    for turn in range(2):  # the second pass follows a complete cleanup
         assert change(client, 'correction_node', Transition.TRANSITION_CONFIGURE)
         assert state(client, 'correction_node') == State.PRIMARY_STATE_INACTIVE
         client.wait_for_diagnostics(
             'correction_node', lambda s: 'the node is not active' in s.message
         )
-        client.publish(replace(frame, number=100 * turn + 1))  # to nobody
+        client.publish(replace(frame, number=100 * turn + 1))  # no subscriber
         assert change(client, 'correction_node', Transition.TRANSITION_ACTIVATE)
         assert state(client, 'correction_node') == State.PRIMARY_STATE_ACTIVE
         client.wait_until(
@@ -83,7 +83,7 @@ def test_node_processes_frames_only_while_active(graph, by_command, tracking):
 
 
 def test_paused_calibration_node_keeps_what_it_has(graph, exposures, tmp_path):
-    """Inactive it takes no frames, but answers; cleanup forgets; parameters can be set."""
+    """An inactive node takes no frames but answers; cleanup discards; parameters can be set."""
     client = graph.client
     expect(client, 'calibration_node')
     client.expect(SetParameters, 'calibration_node/set_parameters')
@@ -111,7 +111,7 @@ def test_paused_calibration_node_keeps_what_it_has(graph, exposures, tmp_path):
     assert client.status().exposures == 1
     assert set_parameter('collect', 'still').successful
     assert change(client, 'calibration_node', Transition.TRANSITION_DEACTIVATE)
-    publish(2)  # to nobody
+    publish(2)  # no subscriber
     assert client.wait_for_diagnostics(
         'calibration_node', lambda s: s.message == 'the node is not active'
     )
@@ -163,7 +163,7 @@ def test_shutdown_by_the_lifecycle(graph, by_command):
 
 
 def test_failed_transition_gives_the_reason_and_changes_nothing(graph):
-    """An invalid quality of service is noticed only when the topics are made."""
+    """An invalid quality of service is noticed only when the topics are created."""
     client = graph.client
     topic = f'qos_overrides.{graph.namespace}/a/target_observations.subscription.reliability'
     expect(client, 'correction_node')
@@ -179,7 +179,7 @@ def test_failed_transition_gives_the_reason_and_changes_nothing(graph):
 
 @pytest.mark.parametrize('kind', [CorrectionNode, ImageNode, ReconstructionNode])
 def test_cleanup_destroys_everything(ros, kind):
-    """However often a manager configures and cleans up a node."""
+    """Nothing remains, however often a manager configures and cleans up a node."""
     node = kind()
     try:
         before = len(list(node.publishers))
@@ -223,7 +223,7 @@ def test_every_parameter_is_described(graph, node):
     assert 'autostart' in own and 'fluoroscopes' in own
     for descriptor in described:
         assert len(descriptor.description) > 10, descriptor.name
-        number = descriptor.type in (2, 3)  # integer, double
+        number = descriptor.type in (2, 3)  # integer or double
         assert bool(descriptor.integer_range or descriptor.floating_point_range) == number, (
             descriptor.name
         )
@@ -231,7 +231,7 @@ def test_every_parameter_is_described(graph, node):
 
 
 def test_two_rigs_in_parallel(node_server, request, graph, by_command, tracking, tmp_path):
-    """Two namespaces, one with simulated time: they do not receive each other's messages."""
+    """Two namespaces, one with simulated time, do not receive each other's messages."""
     (tmp_path / 'other').mkdir()
     other = Graph(tmp_path / 'other', node_server)
     request.node.graphs = [*getattr(request.node, 'graphs', ()), other]
@@ -265,11 +265,9 @@ def test_two_rigs_in_parallel(node_server, request, graph, by_command, tracking,
         assert [m.frame_number for m in graph.points] == [f.number for f in tracking['a'][:20]]
         assert [m.frame_number for m in other.points] == list(
             range(500, 510)
-        )  # though they were paired by stamp
+        )  # although they were paired by stamp
         clock = other.client.create_publisher(Clock, '/clock', 10)
-        ticks = iter(
-            range(1, 10**6)
-        )  # the timers of the node go by the simulated clock, and by nothing else
+        ticks = iter(range(1, 10**6))  # the timers of the node follow the simulated clock only
 
         def ticking():
             clock.publish(Clock(clock=Time(sec=next(ticks))))

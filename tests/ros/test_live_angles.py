@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A correction that depends on the angle of the C-arm: live by joint states, and from a bag."""
+"""Correction that depends on the C-arm angle: live from joint states, and from a bag."""
 
 from array import array
 from dataclasses import replace
@@ -42,17 +42,17 @@ from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader
 from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
 START_NS = 10**18
-STEP_NS = 50_000_000  # between frames, and between states
+STEP_NS = 50_000_000  # between frames, and between joint states
 FRAMES = 60
-STATES = 40  # the last frames have none that is new enough
-BEHIND_NS = 7_000_000  # of a frame after a state
+STATES = 40  # the last frames have no joint state that is recent enough
+BEHIND_NS = 7_000_000  # delay of a frame after its joint state
 JOINTS = 'a:frontal,b:lateral'
 SIGNS = {'a': 1.0, 'b': -1.0}  # of the angles
 
 
 @pytest.fixture
 def turning(calibrated):
-    """Folder with calibrations that depend on the angle, and the calibrations."""
+    """Folder with calibrations that depend on the angle, and these calibrations."""
     calibrations = {n: rigs.turning(c) for n, c in load_calibrations(calibrated).items()}
     for calibration in calibrations.values():
         save_calibration(calibrated, calibration)
@@ -60,8 +60,8 @@ def turning(calibrated):
 
 
 def angle_of_state(number):
-    """Return the angle at a state [rad], at the end beyond all calibrated ones."""
-    return np.deg2rad(2.5 * number - 10) + 1e-9  # files have microdegrees
+    """Return the angle at a state [rad]; the last ones exceed the calibrated range."""
+    return np.deg2rad(2.5 * number - 10) + 1e-9  # files store microdegrees
 
 
 def joint_state(number, stamp_ns=None):
@@ -74,7 +74,7 @@ def joint_state(number, stamp_ns=None):
 
 
 def frames_of(tracking):
-    """Return pairs of frames, each a little after a state, or where one would have been."""
+    """Return pairs of frames, each shortly after a state or after the time of a missing one."""
     return [
         [
             replace(tracking[n][i], number=i, stamp_ns=START_NS + i * STEP_NS + BEHIND_NS)
@@ -92,7 +92,7 @@ def joint_output(client, readers):
 
 
 def publish_states(client, output, node, numbers):
-    """Publish states, and wait until a node has them."""
+    """Publish states and wait until a node has received them."""
     for number in numbers:
         output.publish(joint_state(number))
     for name in NAMES:
@@ -102,7 +102,7 @@ def publish_states(client, output, node, numbers):
 
 
 def test_live_corrections_are_those_of_the_recorded_bag(graph, turning, tracking, tmp_path):
-    """At angles that change, in a gap of the states, and beyond the calibrated angles."""
+    """Covers changing angles, a gap in the states, and angles beyond the calibrated range."""
     folder, calibrations = turning
     client = graph.client
     heard = {n: client.listen(f'{n}/corrected_observations') for n in NAMES}
@@ -181,7 +181,7 @@ def test_diagnostics_say_which_angle_is_used_and_why_it_is_not_known(graph, turn
     frame = frames_of(tracking)[0][0]
 
     def status_after(number, condition):
-        """Publish a frame again until the status of the node fulfils a condition."""
+        """Publish a frame repeatedly until the status of the node fulfils a condition."""
         stamped = replace(frame, number=number, stamp_ns=frame.stamp_ns + number * STEP_NS)
 
         def fulfilled():
@@ -217,7 +217,7 @@ def image_message(image, name, stamp_ns):
 
 
 def test_images_are_corrected_at_the_angle_of_their_stamp(graph, turning, exposures):
-    """As by the maps of the angle; where it is unknown, by the mean, and the node says so."""
+    """Uses the maps of the angle; where it is unknown, the mean, which the node reports."""
     folder, calibrations = turning
     client = graph.client
     found = {n: [] for n in NAMES}
@@ -227,7 +227,7 @@ def test_images_are_corrected_at_the_angle_of_their_stamp(graph, turning, exposu
     node = graph.start(
         'image_node', {'calibration_directory': folder, 'angle_joint': f"'{JOINTS}'"}
     )
-    output = joint_output(client, len(NAMES))  # each fluoroscope has a thread that reads them
+    output = joint_output(client, len(NAMES))  # each fluoroscope has its own thread reading them
     for name in NAMES:
         client.wait_until(shown[name].get_subscription_count, what='the reader of images')
         client.wait_until(
@@ -238,7 +238,7 @@ def test_images_are_corrected_at_the_angle_of_their_stamp(graph, turning, exposu
     pictures = {n: bead_image(exposures[n][0].uv, exposures[n][0].image_size) for n in NAMES}
 
     def corrected(name, stamp_ns):
-        """Return the pixels that the node publishes for an image of a time."""
+        """Return the pixels that the node publishes for an image with a given stamp."""
         message = image_message(pictures[name], name, stamp_ns)
         shown[name].publish(message)
 
@@ -256,7 +256,7 @@ def test_images_are_corrected_at_the_angle_of_their_stamp(graph, turning, exposu
             at_angle = maps.at(SIGNS[name] * angle_of_state(number)).correct(pictures[name])
             assert np.array_equal(pixels, at_angle)
             assert not np.array_equal(pixels, mean)
-        # An arm that stands still needs no further map.
+        # A stationary arm needs no further map.
         assert np.array_equal(corrected(name, START_NS + 20 * STEP_NS + BEHIND_NS + 1), at_angle)
         status = client.wait_for_diagnostics(
             'image_node', lambda s: value_of(s, 'maps made for angles') == '2', name
@@ -271,7 +271,7 @@ def test_images_are_corrected_at_the_angle_of_their_stamp(graph, turning, exposu
     assert node.log.count('angle of the C-arm is unknown: joint frontal: it has no state at') == 1
 
     def status_while_shown(number, condition):
-        """Show images of a time until the status of the node fulfils a condition."""
+        """Publish images with a given stamp until the status of the node fulfils a condition."""
 
         def fulfilled():
             corrected('a', START_NS + number * STEP_NS + next(later))
@@ -289,7 +289,7 @@ def test_images_are_corrected_at_the_angle_of_their_stamp(graph, turning, exposu
 
 
 def test_states_are_taken_before_each_image_that_waits(graph):
-    """Else an image that waits among others would get the angle of the first of them."""
+    """Otherwise a queued image would get the angle of the first image in the queue."""
     client = graph.client
     heard = []
     faults = FaultHandlers(heard.append, lambda *fault: heard.append(fault), heard.append)
@@ -318,7 +318,7 @@ def test_states_are_taken_before_each_image_that_waits(graph):
 
 
 def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
-    """With the doubts of the same exposures offline, which the mean would not have decided."""
+    """Doubtful ids equal those found offline; the mean correction would have decided otherwise."""
     markers.save_turning(tmp_path / 'result')
     markers.write_turned_first(tmp_path / 'first.csv')
     first = {
@@ -398,7 +398,7 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
     assert node.running and 'Traceback' not in node.log
 
     def unknown():
-        """Show an exposure that is too late for the last state, one after the other."""
+        """Publish the next exposure that is too late for the last state; return its status."""
         count = len(found['b'])
         show(last + 1, START_NS + next(late) * 10**9)
         client.wait_until(lambda: len(found['b']) > count, what='its markers')
@@ -411,7 +411,7 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
 
 
 def test_captured_exposures_get_their_angles(graph, exposures, tmp_path):
-    """The calibration by the node is of the same frames and angles as one from a bag."""
+    """The node calibrates from the same frames and angles as a calibration from a bag."""
     client = graph.client
     graph.calibration_node(tmp_path / 'saved', angle_joint="'a:frontal'", rig_frame='rig')
     heard = client.listen('a/calibration')
@@ -439,7 +439,7 @@ def test_captured_exposures_get_their_angles(graph, exposures, tmp_path):
 
 
 def test_calibration_of_an_earlier_bag_is_used(graph, calibrated, tmp_path):
-    """Recorded before the message had angles and a noise profile."""
+    """The bag was recorded before the message had angles and a noise profile."""
     (tmp_path / 'play').mkdir()
     calibration = replace(load_calibrations(calibrated)['a'], noise_profile=None)
     data = serialize_message(message_from_calibration(calibration))

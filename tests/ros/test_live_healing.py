@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Shapes are learned live, the rig is bumped and healed, with the numbers of the command."""
+"""Shapes are learned live; a bumped rig is healed with the same numbers as by the command."""
 
 import itertools
 import json
@@ -33,17 +33,17 @@ from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
-SEED = 1  # of the bags
+SEED = 1  # rig seed of the bags
 EXPOSURES = 60
 RATE_HZ = 120.0
-MOVED_MM = np.array([3.0, -2.0, 3.5])  # 5 mm
-TURNED_RAD = np.radians([0.35, -0.28, 0.22])  # 0.5 degrees
+MOVED_MM = np.array([3.0, -2.0, 3.5])  # norm 5 mm
+TURNED_RAD = np.radians([0.35, -0.28, 0.22])  # norm 0.5 degrees
 COVARIANCE = [f'cov_{name}' for name in ('xx', 'xy', 'xz', 'yy', 'yz', 'zz')]
 FAULTS = ('accept_healing', 'roll_back_healing')
 
 
 def bumped_rig():
-    """The rig of the bags after b was bumped."""
+    """Return the rig of the bags after fluoroscope b was bumped."""
     rig = virtual_rig(SEED)
     a, b = rig.fluoroscopes
     moved = replace(
@@ -55,13 +55,13 @@ def bumped_rig():
 
 
 def later(frame):
-    """A frame of the bumped rig, which comes after those of the healthy one."""
+    """Return a frame of the bumped rig with a stamp after those of the healthy rig."""
     stamp_ns = frame.stamp_ns + round(1e9 * EXPOSURES / 60)
     return replace(frame, number=frame.number + EXPOSURES, stamp_ns=stamp_ns)
 
 
 class Rig:
-    """All nodes with a calibration; a knee walks, and walks on in a bumped rig."""
+    """All nodes with a calibration; a knee walks, and continues in a bumped rig."""
 
     def __init__(self, graph, folder, by_command):
         self.graph = graph
@@ -80,7 +80,7 @@ class Rig:
         self.frames = {name: [later(frame) for frame in bumped[name]] for name in NAMES}
         self.bag = folder / 'bumped'
         write_bag(self.bag, self.frames)
-        # One exposure less does not do.
+        # One exposure fewer would not be enough.
         nodes = graph.whole_chain(
             self.folder, learn_bodies=self.bodies, learn_time=(EXPOSURES - 1.5) / 60
         )
@@ -103,7 +103,7 @@ class Rig:
         )
 
     def publish(self, frames=None):
-        """Publish exposures, by default all of the bump; returns the points (T, n, 3) [mm]."""
+        """Publish exposures, by default all of the bumped rig; return points (T, n, 3) [mm]."""
         before = len(self.points)
         pairs = zip(*((frames or self.frames)[name] for name in NAMES))
         messages = [(one.fluoroscope, message_from_frame(one)) for pair in pairs for one in pair]
@@ -120,14 +120,14 @@ class Rig:
         return out
 
     def healed(self, **fields):
-        """Heal the rig from exactly the exposures; returns the answer of the action."""
+        """Heal the rig from exactly these exposures; return the result of the action."""
         answer = self.client.heal(**fields).get_result_async()
         self.client.wait_until(lambda: self.client.feedback or answer.done(), what='the start')
         self.publish()
         return self.client.result_of(answer)
 
     def stream(self, of_rig=None):
-        """Yield pairs of frames of a knee that walks on and on, of the last rig of a list."""
+        """Yield pairs of frames of an endlessly walking knee, seen by the last rig of a list."""
         of_rig = of_rig or [self.frames]
         step_ns = round(1e9 / RATE_HZ)
         for number in itertools.count(10**6):
@@ -135,14 +135,14 @@ class Rig:
             yield [replace(f, number=number, stamp_ns=10**18 + number * step_ns) for f in pair]
 
     def by_command(self, tmp_path, capsys):
-        """Return healing.json of the same exposures by the command."""
+        """Return the healing.json that the command computes from the same exposures."""
         capsys.readouterr()
         given = ('--calibration', self.calibrated, '--out', tmp_path / 'healed')
         assert run('heal', self.bag, *given, '--json') == 0
         return json.loads(capsys.readouterr().out)
 
     def restart_reconstruction(self):
-        """End the reconstruction node, and start another one."""
+        """End the reconstruction node and start a new one."""
         assert self.reconstruction.end() == 0
         self.transforms.clear()
         self.reconstruction = self.graph.start('reconstruction_node')
@@ -159,7 +159,7 @@ class Rig:
         )
 
     def shape_error_mm(self, points):
-        """RMS error of points relative to each other [mm], after the best rigid motion."""
+        """Return the RMS error of relative point positions [mm], after the best rigid motion."""
         true = np.concatenate(
             [
                 body.xyz_mm @ np.swapaxes(self.motion.rotation[body.name], 1, 2)
@@ -189,7 +189,7 @@ def rig(module_graph, by_command, tmp_path_factory):
 
 @pytest.fixture
 def learned(rig, calibrated):
-    """Folder with a calibration and learned shapes that a test may change."""
+    """Folder with a calibration and learned shapes; a test may change it."""
     shutil.copy(rig.calibrated / LEARNED_SHAPES, calibrated)
     return calibrated
 
@@ -206,7 +206,7 @@ def test_shapes_are_learned_live_to_the_same_bytes(rig):
 
 
 def test_deviations_between_alarm_and_healing_are_those_of_the_recording(rig):
-    """The same bytes live and offline, before the alarm and with what it adds."""
+    """Live and offline covariances are the same bytes, before the alarm and with what it adds."""
     first = len(rig.points) - EXPOSURES
     points = rig.publish()
     frames = {name: [*rig.healthy[name], *rig.frames[name]] for name in NAMES}
@@ -236,7 +236,7 @@ def test_deviations_between_alarm_and_healing_are_those_of_the_recording(rig):
 
 
 def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
-    """Live numbers are those of the command, points are right again, and the parent is kept."""
+    """Live numbers equal those of the command, points are right again, and the parent is kept."""
     before = load_orientation(orientation_path(rig.folder))
     for service in FAULTS:
         refused = rig.client.call(Reset, service)
@@ -305,14 +305,14 @@ def test_page_heals_accepts_and_rolls_back(rig):
         wait(lambda: state()['orientation_id'] == before, what='the rig as calibrated')
 
         def refused():
-            # An answer is lost where the service does not know yet who asks.
+            # The answer is lost if the service has not yet discovered the client.
             assert browser.ask('accept_healing')[0] == 204
             return 'no healed rig to accept' in str(state()['log'])
 
         wait(refused, what='a refusal')
 
         def started():
-            # The page may know the services before it knows the action.
+            # The page may discover the services before the action.
             if not (job := state()['job']):
                 assert browser.ask('heal')[0] == 204
             return 'frames of markers' in job
@@ -415,7 +415,7 @@ def test_healed_rig_accepted_by_the_parameter_outlives_the_node(rig, graph, lear
 
 
 def stream_of(rig, virtual, motion):
-    """Yield pairs of frames of a knee in a virtual rig."""
+    """Yield pairs of frames of a knee seen by a virtual rig."""
     frames = simulate_knee(virtual, rig.knee, motion, seed=3).frames
     for pair in zip(*(frames[n] for n in NAMES)):
         yield [replace(f, stamp_ns=10**18 + f.number * 10**7) for f in pair]
@@ -449,7 +449,7 @@ def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, learned
     before = load_orientation(orientation_path(learned)).orientation_id
     graph.calibration_node(learned, heal_accept=True)
     answer = client.heal(seconds=1.5).get_result_async()
-    # The blocks that the diagnosis does not use show the rig as it was.
+    # The blocks that the diagnosis does not use show the rig before the bump.
     rigs = zip(
         stream_of(rig, bumped_rig(), rig.motion), stream_of(rig, virtual_rig(SEED), rig.motion)
     )
@@ -467,7 +467,7 @@ def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, learned
 def test_too_few_exposures_are_refused(rig, graph, learned):
     client = graph.client
     graph.calibration_node(learned)
-    answer = client.heal(seconds=3.0).get_result_async()  # time for the frames on a busy machine
+    answer = client.heal(seconds=3.0).get_result_async()  # enough for the frames on a busy machine
     few = itertools.islice(stream_of(rig, bumped_rig(), rig.motion), 8)
     client.stream(few, RATE_HZ)
     refused = client.result_of(answer)
@@ -477,7 +477,7 @@ def test_too_few_exposures_are_refused(rig, graph, learned):
 
 
 def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, learned):
-    """From the bump on, nobody asks: the watch, the healing and its acceptance follow."""
+    """No user request: drift watch, healing and acceptance follow the bump automatically."""
     client = graph.client
     before = load_orientation(orientation_path(learned)).orientation_id
     orientations = client.listen('rig_orientation')
@@ -522,7 +522,7 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, learned):
 
 
 def test_nothing_is_learned_after_an_alarm_of_the_drift_watch(rig, graph, calibrated):
-    """Nor after a restart of the node that has given it, and of the one that has heard it."""
+    """Nor after restarts of the node that raised the alarm and of the one that received it."""
     client = graph.client
     parameters = {'learn_bodies': rig.bodies, 'learn_time': 600.0}
     nodes = graph.whole_chain(calibrated, **parameters)

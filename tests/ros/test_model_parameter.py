@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A model that is added to the registry is described by the calibration node's parameter."""
+"""The calibration node's parameter describes a model that is added to the registry."""
 
 from fluoro_calib_ros.correction import registry
 from fluoro_calib_ros.correction.neighbours import KnnModel

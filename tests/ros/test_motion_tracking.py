@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The nodes of docs/integration.md: the one in Python runs in a graph, the one in C++ compiles."""
+"""The nodes of docs/integration.md: the Python node runs in a graph, the C++ node compiles."""
 
 import shutil
 import subprocess
@@ -21,7 +21,7 @@ CLUSTER = range(1001, 1007)
 
 
 def test_python_node_tracks_a_cluster(graph, calibrated, tracking):
-    """The pose takes the cluster of the first frame onto that of every other one."""
+    """The pose maps the cluster of the first frame onto that of every later frame."""
     client = graph.client
     parameters = {'calibration_directory': calibrated}
     nodes = [
@@ -45,7 +45,7 @@ def test_python_node_tracks_a_cluster(graph, calibrated, tracking):
     numbers = iter(range(1, 10_000))
 
     def first_pose():
-        """Publish a frame until all have discovered each other."""
+        """Publish a frame until all nodes have discovered each other."""
         number = next(numbers)
         for name in NAMES:
             client.publish(replace(tracking[name][0], number=number))
@@ -87,7 +87,7 @@ def cluster(message):
 
 
 def test_cpp_node_compiles():
-    """Against the generated headers of the messages, and rclcpp or declarations of it."""
+    """Compile against the generated message headers, and rclcpp or declarations of it."""
     if not shutil.which('g++'):
         pytest.skip('there is no g++')
     include = {Path(prefix) / 'include' for prefix in get_packages_with_prefixes().values()}
@@ -108,7 +108,7 @@ def test_cpp_node_compiles():
 
 @pytest.mark.parametrize('language', ['py', 'cpp'])
 def test_documentation_shows_the_examples(language):
-    """docs/integration.md shows their classes as they are."""
+    """docs/integration.md shows the classes of the examples unchanged."""
     source = (EXAMPLES / f'motion_tracking_node.{language}').read_text()
     end = source.index('\n\nif __name__' if language == 'py' else '\nint main')
     shown = source[source.index('class MotionTracking') : end].rstrip()

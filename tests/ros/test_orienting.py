@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The orientation of the rig, from a calibration or from a capture, and the calibrations it
-belongs to.
+"""Orientation of the rig, from a calibration or a capture, and the calibrations to which it
+belongs.
 """
 
 import numpy as np
@@ -15,9 +15,7 @@ from fluoro_calib_ros.nodes.messages.rig_orientation import orientation_from_mes
 
 
 def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tracking):
-    """Two calibrations in mid-stream: every exposure is reconstructed with the orientation of its
-    own.
-    """
+    """Calibrate twice in mid-stream: each exposure is reconstructed with its own orientation."""
     client = graph.client
     graph.both_nodes(tmp_path / 'calibrations', collect='request', model='none')
     node = graph.start('reconstruction_node')
@@ -39,7 +37,7 @@ def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tra
         client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'), name)
     publish(client, tracking, range(50), answer='b/corrected_observations')
     client.wait_until(lambda: len(points) >= 50, what='the first points')
-    # Another calibration, another orientation.
+    # Another calibration gives another orientation.
     answer = client.call(Calibrate, 'calibrate', loss='gaussian')
     assert answer.success
     publish(client, tracking, range(50, 100), answer='b/corrected_observations')
@@ -53,8 +51,8 @@ def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tra
     client.wait_until(
         lambda: points[-1].frame_number == tracking['a'][149].number, what='the last points'
     )
-    # No frame is lost by the correction, and an exposure is reconstructed wherever both views are
-    # of one orientation.
+    # The correction loses no frame, and every exposure is reconstructed whose views belong to the
+    # same orientation.
     ids = {
         name: {m.frame_number: m.calibration_id for m in of_one}
         for name, of_one in corrected.items()
@@ -69,7 +67,7 @@ def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tra
 
 
 def collect(graph, readers=2):
-    """Play the recorded exposures; the phantom stands in another pose in each."""
+    """Play the recorded exposures; the phantom has a different pose in each."""
     graph.client.call(Reset, 'collect_anew')
     graph.play(BAGS / 'calibration', readers=readers)
     for name in NAMES:
@@ -109,7 +107,7 @@ def test_capture_defines_the_rig_frame_of_the_points(graph, calibrated, tracking
     )
     publish(client, tracking, range(30), answer='b/corrected_observations')
 
-    def of_markers():  # points of the phantom may still be on their way
+    def of_markers():  # points of the phantom may still be in transit
         found = [m for m in points if len(m.target_id) and m.target_id[0] == 1001]
         return found if len(found) >= 30 else None
 
@@ -120,7 +118,7 @@ def test_capture_defines_the_rig_frame_of_the_points(graph, calibrated, tracking
         errors.append((coordinates(m)[0] - true[m.frame_number])[np.array(m.status) <= 1])
     assert (
         np.sqrt((np.concatenate(errors) ** 2).sum(axis=1).mean()) < 0.25
-    )  # mm, against the truth itself
+    )  # mm, against the true points
 
 
 def test_refused_orientation_gives_the_reason(graph, tmp_path, calibrated):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages that come faster than a node takes them."""
+"""Messages that arrive faster than a node processes them."""
 
 import threading
 
@@ -18,7 +18,7 @@ COUNT = 50
 
 @pytest.mark.parametrize('latched', [False, True])
 def test_messages_that_the_queue_has_displaced_are_counted(graph, latched):
-    """Every message is received or counted; of latched topics only the newest ones matter."""
+    """Every message is received or counted; of latched topics only the newest messages matter."""
     client = graph.client
     heard = []
     lost = []

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The player: begins later, waits for a step, pauses, and publishes the time of the recording."""
+"""The player starts with an offset, steps, pauses, and publishes the recorded time."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_player_steps_pauses_and_publishes_the_time(graph):
     for count in (1, 2, 3):
         assert client.call(Trigger, 'player_node/step').success
         client.wait_until(lambda count=count: len(received) == count, what='a message')
-    # During the pause the time stands at the last message.
+    # During the pause, the time stays at the last message.
     client.wait_until(lambda: clock and clock[-1] == later[2], what='the time of the message')
     assert not client.call(SetBool, 'player_node/pause', data=True).success  # already paused
     assert client.call(SetBool, 'player_node/pause', data=False).success

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses and joint angles by points that are taken back are taken back, too; also in bags."""
+"""Poses and joint angles are retracted when points they depend on are retracted, also in bags."""
 
 import numpy as np
 from fluoro_calib_msgs.msg import BodyPoses, JointAngles, Retraction
@@ -20,12 +20,12 @@ from fluoro_calib_ros.simulation.rig import virtual_rig
 
 RATE_HZ = 250.0
 EXPOSURES = 12
-TAKEN = 7  # row of the exposure of which an image point of a is taken back
+TAKEN = 7  # row of the exposure with a retracted image point of a
 FORMS = ('body_poses', 'joint_angles', 'retractions')
 
 
 def started(graph, by_command, knee):
-    """Nodes and a recorder; returns the recorder."""
+    """Start the nodes and a recorder; return the recorder."""
     client = graph.client
     files = {'bodies': graph.directory / 'bodies.csv', 'joints': graph.directory / 'joints.toml'}
     write_bodies(files['bodies'], knee.surveyed)
@@ -64,7 +64,7 @@ def test_poses_by_points_that_are_taken_back(graph, by_command):
     wrong = int(knee.bodies[1].target_id[0])
     taking = client.create_publisher(Retraction, 'a/retractions', observations_qos())
     recorder = started(graph, by_command, knee)
-    # Frames and what is taken back: the reconstruction node, and the recorder.
+    # The reconstruction node and the recorder read frames and retractions.
     client.wait_until(lambda: taking.get_subscription_count() == 2, what='readers')
     client.wait_for_diagnostics(
         'recorder_node', lambda s: value_of(s, 'topics') == '6', 'recorder', 'its topics'
@@ -102,7 +102,7 @@ def test_poses_by_points_that_are_taken_back(graph, by_command):
 
 
 def check_bag(graph, published):
-    """Recorded in their order, and played so."""
+    """Check that the messages are recorded and played in the order of publication."""
     client = graph.client
     place = f'{graph.namespace.strip("/")}/reconstruction'
     again = [client.listen(f'{place}/{form}') for form in FORMS[:2]]
@@ -119,7 +119,7 @@ def check_bag(graph, published):
 
 
 def check_offline(folder, by_command, frames, wrong):
-    """Poses of the bag are those without the image point."""
+    """Check that the poses of the bag are those without the retracted image point."""
     bodies = read_bodies(folder / 'bodies.csv')
     joints = read_joints(folder / 'joints.toml', bodies)
     orientation = load_orientation(orientation_path(by_command))

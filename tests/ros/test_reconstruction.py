@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Points in space from two corrected streams: accuracy, stated precision, and reported faults."""
+"""Points in space from two corrected streams: accuracy, stated precision and reported faults."""
 
 import csv
 import subprocess
@@ -23,7 +23,7 @@ FRAMES = 120
 
 @pytest.fixture(scope='module')
 def rig(module_graph, by_command, tracking):
-    """All three nodes, after the first frames of markers in motion."""
+    """All three nodes, after the first frames of moving markers."""
     graph = module_graph
     client = module_graph.client
     graph.fork = False
@@ -44,7 +44,7 @@ def publish(
     change=lambda frame: frame,
     answer='reconstruction/points_with_covariance',
 ):
-    """Publish frames of both fluoroscopes, in step with the messages that answer them."""
+    """Publish frames of both fluoroscopes in step with the messages that answer them."""
     came = client.messages[answer]
     before = len(came)
     messages = [
@@ -55,7 +55,7 @@ def publish(
 
 
 def truth():
-    """True markers (24, 3) [mm] by frame."""
+    """True markers (24, 3) [mm], by frame."""
     out = {}
     with open(BAGS / 'truth' / 'markers.csv', newline='') as file:
         for row in csv.DictReader(file):
@@ -80,10 +80,10 @@ def coordinates(message):
 
 
 def turned_onto(points, true):
-    """Return the errors (n, 3) after the rotation and shift of points that fit best.
+    """Return the errors (n, 3) of points after their best-fitting rotation and shift.
 
-    The rig frame of a joint calibration is the optical frame of the first fluoroscope, that of the
-    truth is another one.
+    The rig frame of a joint calibration is the optical frame of the first fluoroscope; the truth
+    uses a different frame.
     """
     a = points - points.mean(axis=0)
     b = true - true.mean(axis=0)
@@ -102,7 +102,7 @@ def test_points_are_as_accurate_as_stated(rig):
     errors = turned_onto(
         points[good], np.concatenate([true[m.frame_number] for m in rig.points])[good]
     )
-    assert 0.1 < np.sqrt((errors**2).sum(axis=1).mean()) < 0.2  # mm, with 0.25 px noise
+    assert 0.1 < np.sqrt((errors**2).sum(axis=1).mean()) < 0.2  # mm, with 0.25 px of noise
     normalised = np.einsum('ni,nij,nj->n', errors, np.linalg.inv(covariance[good]), errors) / 3
     assert 0.85 < normalised.mean() < 1.15
 
@@ -143,7 +143,7 @@ def test_the_command_line_gives_the_same_numbers(rig, by_command, tmp_path):
         [[float(r[key] or 'nan') for key in ('x', 'y', 'z', 'residual')] for r in rows]
     )
     assert np.array_equal(np.isnan(live), np.isnan(offline))
-    assert np.nanmax(np.abs(live - offline)) < 1e-6  # mm, px: as many decimals as the file has
+    assert np.nanmax(np.abs(live - offline)) < 1e-6  # mm, px: the precision of the file
 
 
 def test_cloud_and_ellipsoids_are_the_same_points(rig):
@@ -178,8 +178,8 @@ def test_cloud_and_ellipsoids_are_the_same_points(rig):
         ]
     )
     assert np.isclose(np.linalg.norm(turn), 1)
-    # Ten standard deviations to each side; the geometry makes depth less certain than what lies
-    # across.
+    # Ten standard deviations on each side; the geometry makes depth less certain than the
+    # transverse directions.
     axes = np.array([marker.scale.x, marker.scale.y, marker.scale.z]) / 20
     assert (
         np.allclose(np.sum(axes**2), 3 * np.mean(sigma**2), rtol=0.2)
@@ -204,7 +204,7 @@ def test_tf_has_the_positions_of_the_sources(rig, by_command):
 
 
 def test_only_the_false_match_is_rejected(rig, tracking):
-    """Two markers of one view are exchanged: their rays do not meet."""
+    """Two markers are exchanged in one view, so their rays do not meet."""
 
     def exchanged(frame):
         if frame.fluoroscope == 'a':
@@ -227,7 +227,7 @@ def test_only_the_false_match_is_rejected(rig, tracking):
 
 
 def test_thresholds_can_be_set_while_it_runs(rig, tracking):
-    """With a threshold of 1000 standard deviations a shift of 5 px is accepted."""
+    """With a threshold of 1000 standard deviations, a shift of 5 px is accepted."""
     client = rig.client
     client.expect(SetParameters, 'reconstruction_node/set_parameters')
     client.wait_until_known_to('reconstruction_node')
@@ -281,15 +281,13 @@ def test_unpaired_and_late_frames_are_counted(rig, tracking):
     )
     for number in range(100_001, 100_101):
         client.publish(replace(tracking['a'][0], number=number))
-        if (
-            number % 20 == 0
-        ):  # unpaired are those of the 100 that have dropped out of the 64 that wait
+        if number % 20 == 0:  # unpaired: those of the 100 that no longer fit in the queue of 64
             client.wait_for_diagnostics(
                 'reconstruction_node',
                 lambda s: int(value_of(s, 'frames received of a')) >= received + number - 100_000,
                 'reconstruction',
             )
-    client.publish(replace(tracking['b'][0], number=100_002))  # its partner has been given up
+    client.publish(replace(tracking['b'][0], number=100_002))  # its partner has been dropped
     status = client.wait_for_diagnostics(
         'reconstruction_node',
         lambda s: int(value_of(s, 'frames late')) == before['frames late'] + 1,
@@ -317,7 +315,7 @@ def test_the_drift_watch_is_in_the_diagnostics(rig):
 
 
 def test_damaged_corrected_frames_are_counted_by_kind(rig, tracking):
-    """Frames of another publisher: invalid ones are refused, the next ones reconstructed."""
+    """Frames from another publisher: invalid frames are refused, later ones reconstructed."""
     client = rig.client
     output = client.create_publisher(CorrectedObservations, 'a/corrected_observations', 10)
     client.wait_until(lambda: output.get_subscription_count() > 0, what='the reader')

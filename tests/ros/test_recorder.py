@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The recorder: what was published is in the bag, as rosbag2 would have written it."""
+"""The recorder: the bag holds what was published, as rosbag2 would have written it."""
 
 import signal
 
@@ -21,7 +21,7 @@ def recorded(status, key='messages'):
 
 
 def wait_for_recorder(client, topics):
-    """Wait until the recorder receives these topics, and the publishers know it."""
+    """Wait until the recorder receives these topics and their publishers have discovered it."""
     client.wait_for_diagnostics(
         'recorder_node', lambda s: recorded(s, 'topics') == topics, 'recorder'
     )
@@ -37,7 +37,7 @@ def publish_all(client, exposures):
 
 
 def test_recorded_bag_holds_what_was_published(graph, exposures, tmp_path):
-    """To the last bit, with types, hashes, QoS and metadata; latched messages of before, too."""
+    """The bag is exact to the last bit, with types, hashes, QoS, metadata and latched messages."""
     client = graph.client
     latched = client.create_publisher(String, 'note', latched_qos())
     latched.publish(String(data='before the recording'))
@@ -76,7 +76,7 @@ def test_recorded_bag_holds_what_was_published(graph, exposures, tmp_path):
 
 
 def test_killed_recording_is_recovered(graph, exposures, tmp_path):
-    """All but the messages of the last second, and those that are on disk are said to be."""
+    """Only messages of the last second may be lost, none that were reported as written to disk."""
     client = graph.client
     topic = f'{graph.namespace}/a/target_observations'
     recorder = graph.start(
@@ -96,7 +96,7 @@ def test_killed_recording_is_recovered(graph, exposures, tmp_path):
 
 
 def test_command_ends_at_sigterm_with_a_complete_bag(graph, exposures, tmp_path):
-    """`bag record` is the node: it gets the signal, and gives its exit status."""
+    """`bag record` runs the node itself: it receives the signal and returns the exit status."""
     client = graph.client
     topic = f'{graph.namespace}/a/target_observations'
     process = Process(

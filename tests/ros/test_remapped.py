@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Remapped streams: faults are reported with the name of the fluoroscope."""
+"""Remapped streams: fault reports contain the name of the fluoroscope."""
 
 import pytest
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Ids that were published live and turn out wrong are taken back, also in space and in bags."""
+"""Wrong ids that were published live are retracted, also for points in space and in bags."""
 
 import numpy as np
 import pytest
@@ -18,13 +18,13 @@ from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
 EXPOSURES = 6
-WRONG, OTHER = 0, 6  # rows of a marker, and of one of another body whose shadow it is given
+WRONG, OTHER = 0, 6  # rows of a marker, and of a marker of another body whose shadow it is given
 SIZE = (1024, 1024)
 
 
 @pytest.fixture
 def rig(graph):
-    """The chain from images to points, and images; one marker of a is another's shadow."""
+    """The chain from images to points, with images; one marker of a gets the shadow of another."""
     folder = graph.directory / 'chain'
     folder.mkdir()
     write_chain(folder, EXPOSURES)
@@ -71,12 +71,12 @@ def test_a_marker_that_was_something_else_is_taken_back(rig):
         'reconstruction',
         'the orientation',
     )
-    rig.wait_for_readers(2, 'extraction_node')  # the correction node, and the client
+    rig.wait_for_readers(2, 'extraction_node')  # the correction node and the client
     rig.wait_for_readers(2, 'extraction_node', key='readers of retractions')
     rig.wait_for_readers(1)
     for number, message in enumerate(iterate_messages(rig.folder / 'images')):
         outputs[message.topic.split('/')[1]].publish(message.data)
-        if number % 2:  # both views of an exposure
+        if number % 2:  # both views of an exposure are published
             count = number // 2 + 1
             client.wait_until(
                 lambda count=count: (
@@ -97,7 +97,7 @@ def test_a_marker_that_was_something_else_is_taken_back(rig):
         assert message.frame_number == point.frame_number == observed['a'][exposure].frame_number
         assert point.header == points[exposure].header
     assert not client.messages['b/retractions']
-    # A bag of the same messages, read offline, has none of these image points.
+    # A bag of the same messages, read offline, contains none of these image points.
     with BagWriter(rig.folder / 'bag') as bag:
         for kind, messages in (('TargetObservations', observed['a']), ('Retraction', taken)):
             topic = 'retractions' if kind == 'Retraction' else 'target_observations'

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""config/shed_floods.xml: what finds no place while a reader waits is sent again."""
+"""config/shed_floods.xml: messages that find no place while a reader waits are sent again."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ import sys
 from ros_graph import ROOT
 
 HONEST = 80
-# Lines on its output tell what is done; on its input, that the next step may begin.
+# Output lines report each finished step; input lines allow the next step to begin.
 PUBLISH = """
 import sys
 import rclpy
@@ -58,7 +58,7 @@ os._exit(0)
 
 
 def test_flood_displaces_its_own_messages(ros):
-    """Of 2,000 while the reader takes nothing; all others arrive."""
+    """Part of a flood of 2,000 to an idle reader is displaced; all other messages arrive."""
     profile = str(ROOT / 'config' / 'shed_floods.xml')
     done = subprocess.run(
         [sys.executable, '-c', READ, str(HONEST), PUBLISH],

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The parameter use_sim_time without /clock: nodes do not fall silent, and no peer can set it."""
+"""use_sim_time without /clock: nodes do not fall silent, and no peer can set the parameter."""
 
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -16,7 +16,7 @@ FRAMES = 5
 
 @pytest.fixture
 def client(graph, tmp_path):
-    """Client of a graph whose nodes have the time of a /clock that nobody publishes."""
+    """Client of a graph whose nodes use a /clock that nobody publishes."""
     for node in NODES:
         graph.client.expect(SetParameters, f'{node}/set_parameters')
     graph.calibration_node(tmp_path / 'none', wait=False, use_sim_time='true')
@@ -50,7 +50,7 @@ def test_nodes_go_on_and_say_that_there_is_no_clock(graph, client, exposures, tm
 
 
 def test_no_peer_sets_it(graph):
-    """A running node would change from one time to the other."""
+    """Otherwise a running node would change from one time to another."""
     client = graph.client
     client.expect(SetParameters, 'correction_node/set_parameters')
     graph.start('correction_node')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Start and end of the nodes: one sentence where a node cannot start, exit status 0 at an
+"""Start and end of the nodes: one sentence if a node cannot start, exit status 0 after an
 interrupt.
 """
 
@@ -36,7 +36,7 @@ def damaged_bag(folder):
     shutil.copytree(BAGS / 'tracking', folder / 'bag')
     file = folder / 'bag' / 'tracking_0.mcap'
     content = bytearray(file.read_bytes())
-    content[len(content) // 3] ^= 0xFF  # within a chunk: it shows only while playing
+    content[len(content) // 3] ^= 0xFF  # inside a chunk: noticed only while playing
     file.write_bytes(content)
     return {'bag': folder / 'bag', 'wait_for_readers': 0, 'rate': 1000.0}
 
@@ -50,7 +50,7 @@ def foreign_bag(folder):
 
 
 def small_bag(folder, type_name='std_msgs/msg/Int64', topic='/x', messages=1, **how):
-    """Write a bag with one topic; returns the parameters to play it."""
+    """Write a bag with one topic; return the parameters that play it."""
     with open(folder / 'small.mcap', 'wb') as file:
         writer = Writer(file)
         writer.start('ros2', 'test')
@@ -212,7 +212,7 @@ def test_interrupt_in_the_stream_ends_every_node_cleanly(graph, by_command, expo
     )
     for node in reversed(nodes):
         node.interrupt()
-        node._process.send_signal(signal.SIGTERM)  # service managers send both at the same time
+        node._process.send_signal(signal.SIGTERM)  # service managers send both signals at once
     client.wait_until(lambda: not any(n.running for n in nodes), 15, 'the nodes to end')
     for node in nodes:
         assert node.wait() == 0
@@ -229,7 +229,7 @@ def test_interrupt_in_the_stream_ends_every_node_cleanly(graph, by_command, expo
     ],
 )
 def test_signal_at_the_first_moment_that_a_node_handles_it(graph, tmp_path, node, parameters):
-    """It has not even joined the graph."""
+    """The node has not even joined the graph."""
     if 'folder' in parameters:
         parameters = {'folder': tmp_path / parameters['folder']}
     graph.fork = False
@@ -265,7 +265,7 @@ def test_interrupt_ends_a_running_job_and_a_waiting_capture(graph, exposures, tm
 
 
 def test_namespaces_are_separate(graph, exposures, tmp_path):
-    """A node of another namespace receives nothing of this one, unless it is remapped."""
+    """A node receives nothing from another namespace unless it is remapped."""
     client = graph.client
     graph.calibration_node(tmp_path / 'none')
     other = graph.start('correction_node', remaps={'__ns': '/elsewhere'}, wait=False)
@@ -282,8 +282,7 @@ def test_namespaces_are_separate(graph, exposures, tmp_path):
         wait=False,
     )
     client.wait_until(lambda: client.subscriptions_matched('second'), what='the remapped node')
-    # An interrupt that comes while a process still loads its modules would end it with another
-    # status.
+    # An interrupt while a process still loads its modules would end it with another status.
     client.wait_until(
         lambda: ('correction_node', '/elsewhere') in client.get_node_names_and_namespaces(),
         what='the other node',
@@ -299,7 +298,7 @@ def test_namespaces_are_separate(graph, exposures, tmp_path):
 
 
 def test_impossible_requests_are_answered(graph, tmp_path):
-    """Impossible timeouts and unknown home folders are refused, and the node goes on."""
+    """Impossible timeouts and unknown home folders are refused, and the node continues."""
     node = graph.calibration_node(tmp_path)
     client = graph.client
     for seconds in (1e300, 1e10):
@@ -322,7 +321,7 @@ def test_impossible_requests_are_answered(graph, tmp_path):
 
 
 def test_player_latches_recorded_latched_topics(graph, by_command):
-    """A late subscriber receives a recorded latched calibration."""
+    """A late subscriber receives a latched calibration from a recording."""
     from fluoro_calib_ros.io.bags.metadata import PROFILES, to_yaml
 
     calibration = load_calibrations(by_command)['a']
@@ -353,7 +352,7 @@ def test_player_latches_recorded_latched_topics(graph, by_command):
 
 
 def test_best_effort_publisher_is_received(graph, calibrated, exposures):
-    """As drivers publish; the log says that lost messages are not sent again."""
+    """Drivers publish this way; the log warns that lost messages are not resent."""
     client = graph.client
     client.listen('a/corrected_observations')
     qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -383,7 +382,7 @@ def test_best_effort_publisher_is_received(graph, calibrated, exposures):
 
 
 def test_mixed_publishers_are_reported(graph, tmp_path):
-    """A reliable subscription stays while one publisher is reliable, and the other is named."""
+    """A reliable subscription remains while one publisher is reliable; the other one is named."""
     client = graph.client
     graph.calibration_node(tmp_path)
     graph.start('correction_node')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A stream that goes on: what came before, beside or instead of it does not stop it."""
+"""A stream continues regardless of earlier, additional or missing messages and nodes."""
 
 import itertools
 import signal
@@ -28,7 +28,7 @@ class Rig:
         self._pairs = list(zip(*(tracking[n][:COUNT] for n in NAMES)))
 
     def stream(self, later_s=0.0, number=0):
-        """Publish all pairs; returns once each is reconstructed."""
+        """Publish all pairs; return once each is reconstructed."""
         before = len(self.points)
         for sent, pair in enumerate(self._pairs):
             self.client.wait_until(
@@ -41,9 +41,9 @@ class Rig:
         self.client.wait_until(lambda: len(self.points) == before + COUNT, what='all points')
 
     def wait_until_reconstructed(self):
-        """Publish pairs until points come again, and wait for those of the last pair.
+        """Publish pairs until points arrive again, and wait for those of the last pair.
 
-        The first ones are lost where nodes have just been started.
+        The first pairs are lost if nodes have just been started.
         """
         before = len(self.points)
         numbers = itertools.count(max(self.points[-1].frame_number, 10**6) + 1)
@@ -70,7 +70,7 @@ def rig(module_graph, by_command, tracking):
 
 
 def test_repeated_recording_and_clocks_that_jump(rig):
-    """Nothing is lost when a bag is played again, nor by clocks that go back or forth."""
+    """Nothing is lost when a bag is replayed or clocks jump forwards or backwards."""
     rig.stream()
     rig.stream()
     rig.stream(later_s=-3600.0, number=COUNT)
@@ -80,7 +80,7 @@ def test_repeated_recording_and_clocks_that_jump(rig):
 
 
 def test_subscriber_that_never_reads_holds_nobody_up(rig, tmp_path):
-    """It has stopped, but is there, and asks for reliable messages."""
+    """The subscriber is stopped but still present, and requests reliable messages."""
     topics = [f'{rig.graph.namespace}/{POINTS}']
     topics += [f'{rig.graph.namespace}/{n}/corrected_observations' for n in NAMES]
     reader = rig.graph.start('recorder_node', {'folder': tmp_path / 'bag', 'topics': str(topics)})
@@ -89,7 +89,7 @@ def test_subscriber_that_never_reads_holds_nobody_up(rig, tmp_path):
         what='the reader',
     )
     reader._process.send_signal(signal.SIGSTOP)
-    for _ in range(5):  # twice what a queue holds
+    for _ in range(5):  # twice the queue length
         rig.stream()
     reader._process.send_signal(signal.SIGCONT)
     assert reader.end() == 0 and rig.is_clean()
@@ -129,7 +129,7 @@ def test_node_killed_in_mid_stream_is_replaced(rig, node):
     rig.nodes[node]._process.kill()
     rig.nodes[node].wait()
     if node == 'calibration_node':
-        rig.stream()  # nobody needs it for that
+        rig.stream()  # the stream does not depend on it
         rig.nodes[node] = rig.graph.calibration_node(rig.folder)
     else:
         rig.nodes[node] = rig.graph.start(node, wait=False)

@@ -30,7 +30,7 @@ THREE = ('a', 'b', 'c')
 POSES = 9
 RATE_HZ = 15.0
 PATIENCE = 8
-# markers; frames of c end there, and b drifts from there on
+# frames of markers; c ends here, and b drifts from here on
 FRAMES = 360
 SILENT = 300
 DRIFT = 210
@@ -39,12 +39,12 @@ START = START_NS + 10**12
 
 
 def a_rig():
-    """The rig whose phantom is that of bags/, with a third fluoroscope."""
+    """Return the rig whose phantom is that of bags/, with a third fluoroscope."""
     return virtual_rig(1, names=THREE, between_deg=60.0)
 
 
 def standing(of_rig, number, stamp_ns):
-    """Return a frame of each fluoroscope of the phantom standing in the rig frame."""
+    """Return a frame of each fluoroscope with the phantom stationary in the rig frame."""
     rng = np.random.default_rng(number)
     for f in of_rig.fluoroscopes:
         ids, uv = detect_beads(rng, f, of_rig.true_mm, of_rig.phantom.target_id)
@@ -52,7 +52,7 @@ def standing(of_rig, number, stamp_ns):
 
 
 def started(graph, folder):
-    """Start the three nodes for three fluoroscopes; returns the reconstruction node."""
+    """Start the three nodes for three fluoroscopes; return the reconstruction node."""
     client = graph.client
     three = {'fluoroscopes': '[a, b, c]'}
     client._outputs['c'] = client.create_publisher(
@@ -100,7 +100,7 @@ def calibrated(graph, of_rig):
 
 
 def restart_drift_watch(graph, node, markers, points):
-    """Restart the drift watch by a new orientation; returns its DiagnosticStatus."""
+    """Restart the drift watch by a new orientation; return its DiagnosticStatus."""
     client = graph.client
     key = 'reconstruction_node: reconstruction'
     for number in range(2000, NUMBER):
@@ -124,8 +124,8 @@ def restart_drift_watch(graph, node, markers, points):
 def marker_frames(of_rig):
     """Return the tracking with a drift of b and lost frames of c.
 
-    Half of the image of b is shifted by 1 px at the end. c loses frames at random, and all at the
-    end.
+    Half of the image of b is shifted by 1 px at the end. c loses frames at random, and all frames
+    at the end.
     """
     tracking = simulate_tracking(
         of_rig, FRAMES / RATE_HZ, RATE_HZ, 5, start=StreamStart(START, NUMBER)
@@ -140,7 +140,7 @@ def marker_frames(of_rig):
 
 
 def streamed(client, kept, points):
-    """Publish frames exposure by exposure, in step with the points; returns their messages."""
+    """Publish frames exposure by exposure, in step with the points; return the point messages."""
     by_number = {}
     for frame in sorted(
         (f for of_one in kept.values() for f in of_one), key=lambda f: (f.number, f.fluoroscope)
@@ -148,8 +148,8 @@ def streamed(client, kept, points):
         by_number.setdefault(frame.number, []).append(frame)
     before = len(points)
     sent = np.cumsum([0, *map(len, by_number.values())])
-    # As many ahead as it takes to find c silent, and no more: else it is taken for silent while
-    # its frames wait.
+    # Stay just far enough ahead for c to be recognised as silent: with more, c would count as
+    # silent while its frames wait.
     client.publish_in_step(
         [(f.fluoroscope, message_from_frame(f)) for of_one in by_number.values() for f in of_one],
         lambda: sent[len(points) - before],
@@ -160,7 +160,7 @@ def streamed(client, kept, points):
 
 
 def check_points(messages, tracking, there):
-    """Check that every exposure comes once and in order; three rays are more precise than two."""
+    """Check that exposures come once and in order; three rays are more precise than two."""
     assert [m.frame_number for m in messages] == list(range(NUMBER, NUMBER + FRAMES))
     errors = {2: [], 3: []}
     sd = {2: [], 3: []}
@@ -185,7 +185,7 @@ def check_points(messages, tracking, there):
 
 
 def check_mixed(client, last, markers, points):
-    """Check that views of calibrations of different orientations are not intersected."""
+    """Check that views whose calibrations belong to different orientations are not intersected."""
     before = int(
         value_of(
             client.statuses['reconstruction_node: reconstruction'], 'exposures without orientation'
@@ -250,7 +250,7 @@ def offline(folder, kept, path):
 
 
 def test_points_are_published_while_views_are_missing(graph, tmp_path):
-    """Frames of c are lost at random, then it is silent; the drift of b is found as offline."""
+    """Frames of c are lost at random, then c falls silent; the drift of b is found as offline."""
     client = graph.client
     folder = tmp_path / 'calibration'
     of_rig = a_rig()
@@ -274,7 +274,7 @@ def test_points_are_published_while_views_are_missing(graph, tmp_path):
         'the count of incomplete exposures',
     )
     assert value_of(status, 'frames late') == value_of(before, 'frames late')
-    # The other streams may have ended by now, which the message says, too.
+    # The other streams may have ended by now; the message would mention that, too.
     assert 'no frames of c, points are reconstructed from the other fluoroscopes' in status.message
     rows, result = offline(folder, kept, tmp_path)
     live = np.concatenate([1e3 * np.stack([m.x, m.y, m.z], axis=1) for m in messages])

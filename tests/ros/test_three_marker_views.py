@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Markers of three fluoroscopes, live: images in, ids by the shapes of bodies, points in space."""
+"""Markers of three fluoroscopes, live: images, ids from the shapes of bodies, points in space."""
 
 from array import array
 
@@ -15,7 +15,7 @@ from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
 EXPOSURES = 5
-LOST = 4  # exposure whose image of b does not come
+LOST = 4  # exposure whose image of b is missing
 HIDDEN = 1  # row of a marker that c does not see
 
 
@@ -33,7 +33,7 @@ def message_of(image, name, number):
 
 
 def test_markers_of_three_fluoroscopes_are_followed_together(graph):
-    """A marker that c does not see is known by a and b; an exposure lacks b."""
+    """A marker hidden from c is identified by a and b; one exposure has no image of b."""
     folder = graph.directory / 'result'
     save_three(folder)
     write_bodies(graph.directory / 'bodies.csv', bodies())
@@ -62,7 +62,7 @@ def test_markers_of_three_fluoroscopes_are_followed_together(graph):
         'reconstruction',
         'the orientation',
     )
-    graph.wait_for_readers(2, 'extraction_node', THREE)  # the correction node, and the client
+    graph.wait_for_readers(2, 'extraction_node', THREE)  # the correction node and the client
     graph.wait_for_readers(1, names=THREE)
     for number, of in enumerate(sequence()[:EXPOSURES], 1):
         for name, image in of.items():

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Two rigs in two namespaces, each with its own calibrations: whatever order their nodes are
-started, killed and started again in, they end up correcting, each with its own.
+"""Two rigs in two namespaces, each with its own calibrations: in whatever order their nodes are
+started, killed and restarted, each rig ends up correcting with its own calibrations.
 """
 
 import random
@@ -18,7 +18,7 @@ from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 
 @pytest.fixture
 def rigs(node_server, request, graph, calibrated, tmp_path):
-    """Two graphs; .folder has the calibrations of each, .ids their ids by fluoroscope."""
+    """Two graphs; .folder holds the calibrations of each, .ids their ids by fluoroscope."""
     (tmp_path / 'other').mkdir()
     other = Graph(tmp_path / 'other', node_server)
     request.node.graphs = [*getattr(request.node, 'graphs', ()), other]
@@ -43,7 +43,7 @@ def start(rig, node):
 
 
 def wait_until_corrected(rig, frame):
-    """Publish frames until one of each fluoroscope comes back, and test by which calibration."""
+    """Publish frames until each fluoroscope returns one, and check which calibration was used."""
     numbers = iter(range(10_000))
     for name in NAMES:
         rig.corrected[name].clear()
@@ -69,7 +69,7 @@ def test_two_rigs_end_up_correcting(rigs, tracking):
         start(rig, node)
     for rig in rigs:
         wait_until_corrected(rig, frame)
-    # Each of them again, half of them killed, while the others run or start.
+    # Restart every node, killing half of them first, while the others run or start.
     order.shuffle(nodes)
     for number, (rig, node) in enumerate(nodes):
         process = rig.nodes[node]

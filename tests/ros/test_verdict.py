@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verdict on a calibration in the answer of a job that asks for it."""
+"""The verdict on a calibration in the answer of a job that requests it."""
 
 import json
 from html import escape
@@ -16,7 +16,7 @@ from fluoro_calib_ros.nodes.messages.self_calibration import feedback_text
 
 
 def told(client):
-    """What somebody learns who joins later: the verdict and its findings."""
+    """Return what a late subscriber receives: the verdict and its findings."""
     watch = SessionClient(client.get_namespace(), client.context)
     client._spinner.add_node(watch)
     client.wait_until(lambda: watch.state().verdict, what='the verdict')
@@ -32,7 +32,7 @@ def told(client):
 
 
 def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
-    """A model that corrects nothing is published, its verdict is fail, with the reason."""
+    """A model that corrects nothing is published; its verdict is fail, with the reason."""
     client = rig.client
     done = client.result_of(
         client.goal(model='none', fluoroscopes=['b'], validate=True).get_result_async()

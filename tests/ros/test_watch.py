@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The dashboard's client and the calibration node: a session without the command ros2."""
+"""The dashboard's client and the calibration node: a session without the ros2 command."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ def watch(graph):
 
 
 def test_session_is_run_from_the_dashboard(graph, watch, exposures, tmp_path):
-    """It shows the exposures and what is missing, and captures, resets and calibrates."""
+    """The dashboard shows exposures and what is missing; it captures, resets and calibrates."""
     node = graph.calibration_node(tmp_path / 'out', collect='request', phantm='mistyped')
     client = graph.client
     assert 'there is no parameter phantm, it has no effect; did you mean phantom?' in node.log
@@ -71,7 +71,7 @@ def test_session_is_run_from_the_dashboard(graph, watch, exposures, tmp_path):
 
 @pytest.mark.parametrize('action', ['capture', 'calibrate_fast'])
 def test_request_without_answer_is_reported(graph, watch, tmp_path, monkeypatch, action):
-    """A suspended node stands for every lost answer; what comes late is shown."""
+    """A suspended node represents every lost answer; a late answer is shown."""
     monkeypatch.setattr('fluoro_calib_ros.nodes.dashboard.watch.ANSWER_S', 0.1)
     node = graph.calibration_node(tmp_path / 'out', collect='request', capture_timeout=0.1)
     wait = graph.client.wait_until

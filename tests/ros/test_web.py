@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of fluoro-calib watch --web: what it shows of a rig, and whom it obeys."""
+"""The page of fluoro-calib watch --web: what it shows of a rig, and whose requests it accepts."""
 
 import base64
 import json
@@ -23,14 +23,14 @@ from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 
 
 class Browser:
-    """Somebody who opens the address that the command has printed, and asks for more."""
+    """A user who opens the printed address and sends further requests."""
 
     def __init__(self, address):
         self._base, self._token = address.split('/?')
         self._opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
 
     def open(self, path, method='GET', headers=None):
-        """Return status, type of the content, and content."""
+        """Return status, content type and content."""
         request = urllib.request.Request(self._base + path, method=method, headers=headers or {})
         try:
             with self._opener.open(request, timeout=60) as answer:
@@ -39,7 +39,7 @@ class Browser:
             return error.code, error.headers.get_content_type(), error.read()
 
     def enter(self):
-        """Open the page with the token; returns where one ends up."""
+        """Open the page with the token; return the final address."""
         with self._opener.open(f'{self._base}/?{self._token}', timeout=60) as answer:
             return answer.url.removeprefix(self._base), answer.read().decode()
 
@@ -54,7 +54,7 @@ class Browser:
 
 @contextmanager
 def page(graph):
-    """Run the command beside the nodes of a graph, and yield it and a browser."""
+    """Run the command alongside the nodes of a graph; yield the command and a browser."""
     command = [*entry_point('cli'), 'watch', '--web', '--port', '0']
     command += ['--namespace', graph.namespace, '--dicom', str(graph.directory)]
     process = Process(command, graph.directory / 'watch.log', graph.environment)
@@ -84,7 +84,7 @@ def test_only_who_has_the_token_is_answered_and_only_this_page_acts(graph):
         assert browser.ask('explode')[0] == 404
         assert browser.ask('capture')[0] == 204
         assert 'capture: no calibration node answers' in browser.json('/state')['log'][-1]
-        assert browser.open('/fluoroscopes/a/radiograph')[0] == 404  # of no fluoroscope
+        assert browser.open('/fluoroscopes/a/radiograph')[0] == 404  # no such fluoroscope
         status, _, reason = browser.open('/report')
         assert status == 404 and b'no result of a calibration' in reason
         process.interrupt()

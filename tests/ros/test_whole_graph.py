@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The main job over real nodes: collect exposures, calibrate, correct markers in motion."""
+"""The main task on real nodes: collect exposures, calibrate, correct moving markers."""
 
 import csv
 import json
@@ -65,7 +65,7 @@ def by_service(rig):
 
 @pytest.fixture(scope='module')
 def tracked(rig, by_service, tracking):
-    """Corrected messages of bags/tracking by fluoroscope."""
+    """Corrected messages of bags/tracking, by fluoroscope."""
     client = rig.client
     for name, used in zip(by_service.fluoroscope, by_service.calibration_id):
         client.wait_for_diagnostics(
@@ -125,7 +125,7 @@ def test_action_gives_feedback_and_the_same_result(rig, by_service):
         rmse = np.hypot([m.rmse_u for m in rounds], [m.rmse_v for m in rounds])
         assert (np.diff(rmse) < 2e-3).all() and rmse[-1] < 0.99 * rmse[
             0
-        ]  # down, and then flat to that
+        ]  # decreases to that value, then stays flat
         assert (
             rounds[-1].k == by_service.k[f]
             and rounds[-1].cost_adjustment < rounds[0].cost_adjustment
@@ -167,8 +167,8 @@ def test_every_frame_is_corrected_with_its_header(tracked, tracking, by_service,
     status = np.concatenate([m.status for m in tracked[name]])
     assert (status == CorrectedObservations.OK).mean() > 0.99
     sigma = np.concatenate([m.sigma for m in tracked[name]])[status == CorrectedObservations.OK]
-    # The scale of the Student-t noise, which is less than a standard deviation, and that of the
-    # correction
+    # The scale of the Student-t noise, which is below its standard deviation, combined with that
+    # of the correction
     assert sigma.min() > 0.6 * NOISE_PX and sigma.max() < 1.5 * NOISE_PX
 
 
@@ -179,7 +179,7 @@ def test_corrected_markers_match_the_truth(tracked, tracking, name):
     corrected = np.concatenate([np.column_stack([m.u, m.v]) for m in tracked[name]])
     observed = np.concatenate([frame.uv for frame in tracking[name]])
     assert rmse_after_homography(corrected, true) < 1.2 * NOISE_PX
-    # what a homography cannot mend, whatever part of the image the markers cross
+    # a homography cannot remove it, whichever part of the image the markers cross
     assert rmse_after_homography(observed, true) > 2 * NOISE_PX
 
 
@@ -197,7 +197,7 @@ def test_camera_info_of_the_corrected_stream(rig, tracked, by_service, name):
 
 
 def ideal_pixels(name):
-    """Ideal pixels (2,) of the markers by (frame, marker), from the truth."""
+    """Return the ideal pixels (2,) of the markers by (frame, marker), from the truth."""
     rig = json.loads((BAGS / 'truth' / 'rig.json').read_text())['fluoroscopes'][name]
     with open(BAGS / 'truth' / 'markers.csv', newline='') as file:
         rows = [
@@ -225,7 +225,7 @@ def ideal_pixels(name):
 def rmse_after_homography(uv, true):
     """Return the RMSE [px] of uv (n, 2) against true (n, 2) after the best projective map.
 
-    A calibration cannot determine more: shift, rotation and scale of the sensor belong to the
+    A calibration cannot determine more: shift, rotation and scale of the sensor are part of the
     orientation.
     """
     x, y = ((true - 512) / 512).T

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A calibration that cannot be right is neither saved nor published, and diagnostics say so."""
+"""A calibration that cannot be right is neither saved nor published; diagnostics report this."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from ros_graph import NAMES
 
 
 def relabelled(frame):
-    """The frame with ids that are too large by 1."""
+    """Return the frame with ids that are 1 too large."""
     ids = frame.target_id + 1
     known = ids <= 503
     return replace(frame, target_id=ids[known], uv=frame.uv[known])
@@ -38,7 +38,7 @@ def test_wrong_ids_are_refused_with_their_cause(graph, exposures, tmp_path):
         assert status.message.endswith('no calibration is in use')
         assert client.messages[f'{name}/calibration'] == []
     assert not folder.exists() or not list(folder.iterdir())
-    # With the right ids it recovers.
+    # With the correct ids, the node recovers.
     assert client.call(Reset, 'reset').success
     client.wait_for_diagnostics('calibration_node', lambda s: s.level != b'\2')
     for pair in pairs:

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 // SPDX-License-Identifier: Apache-2.0
 
-// Prints a line for every message of MCAP files: topic, times, digests of its bytes and its values.
+// Prints a line for every message of MCAP files: topic, times, digests of its bytes and values.
 // node read_bag.mjs FILE...
 
 import { createHash } from 'node:crypto';

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read every kind of bag that this package writes with three other readers, and compare them.
+"""Read every kind of bag that this package writes with three other readers, and compare results.
 
 python tools/bag_readers/read_bags.py [FOLDER ...]
 
 The readers: mcap (Python), rosbags, and @mcap/core with @foxglove/rosmsg2-serialization (npm,
-installed beside this file by `make bag-readers`). Each message has to have the same topic, times
-and bytes, and the two that decode have to find the same values. Without folders, bags are made:
-by simulate, by a recording in parts with images and latched messages, and by recovering a cut-off
-one.
+installed next to this file by `make bag-readers`). All must find the same topic, times and bytes
+of each message, and the two that decode must find the same values. Without folders, bags are made:
+by simulate, by a recording in parts with images and latched messages, and by recovering a
+truncated bag.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ STRING = 'std_msgs/msg/String'
 
 
 def made_bags(folder: Path) -> list[Path]:
-    """Write bags of all kinds; returns their folders."""
+    """Write bags of all kinds; return their folders."""
     simulate(folder / 'rig', SimulationOptions(1, 5, 0, 1.0))
     tracking = folder / 'rig' / 'tracking'
     recorded = folder / 'recorded'
@@ -72,7 +72,7 @@ def made_bags(folder: Path) -> list[Path]:
 
 
 def record(path: Path, tracking: Path) -> None:
-    """Record frames, images and a latched message in files of 1 MB."""
+    """Record frames, images and a latched message in files of 1 MB each."""
     types = typestore().types
     recording = Recording(path, RecordingOptions(split_size=1.0, flush_period=0.05))
     recording.start()
@@ -107,7 +107,7 @@ Message = tuple[str, int, int, str]  # topic, times of reception and publication
 
 
 def by_mcap(bag: Path) -> Counter[Message]:
-    """Read the messages of a bag with the package mcap."""
+    """Read the messages of a bag with the Python package mcap."""
     found: Counter[Message] = Counter()
     for path in sorted(bag.glob('*.mcap')):
         with open(path, 'rb') as file:
@@ -118,10 +118,10 @@ def by_mcap(bag: Path) -> Counter[Message]:
 
 
 def by_rosbags(bag: Path) -> tuple[Counter[tuple[str, int, str]], Counter[tuple[str, int, str]]]:
-    """Read a bag with rosbags; returns digests of the bytes and of the values."""
+    """Read a bag with rosbags; return digests of the bytes and of the values."""
     raw: Counter[tuple[str, int, str]] = Counter()
     values: Counter[tuple[str, int, str]] = Counter()
-    with AnyReader([bag]) as reader:  # with the definitions of the bag
+    with AnyReader([bag]) as reader:  # uses the message definitions stored in the bag
         for connection, time_ns, data in reader.messages():
             raw[connection.topic, time_ns, hashlib.sha256(data).hexdigest()] += 1
             message = reader.deserialize(data, connection.msgtype)
@@ -150,7 +150,7 @@ def add_values(hashed: Any, value: Any) -> None:
 
 
 def by_foxglove(bag: Path) -> tuple[Counter[Message], Counter[tuple[str, int, str]]]:
-    """Read a bag with the npm packages; returns digests of the bytes and of the values."""
+    """Read a bag with the npm packages; return digests of the bytes and of the values."""
     raw: Counter[Message] = Counter()
     values: Counter[tuple[str, int, str]] = Counter()
     done = subprocess.run(
@@ -168,7 +168,7 @@ def by_foxglove(bag: Path) -> tuple[Counter[Message], Counter[tuple[str, int, st
 
 
 def compare(bag: Path) -> int:
-    """Compare what the readers find in a bag; returns the number of messages."""
+    """Compare the results of the readers for a bag; return the number of messages."""
     one = by_mcap(bag)
     raw, values = by_rosbags(bag)
     other, other_values = by_foxglove(bag)
@@ -186,7 +186,7 @@ def compare(bag: Path) -> int:
 
 
 def main() -> None:
-    """Compare the bags of the command line, or those that are made."""
+    """Compare the bags given on the command line, or newly created ones."""
     with tempfile.TemporaryDirectory() as folder:
         bags = [Path(word).resolve() for word in sys.argv[1:]] or made_bags(Path(folder))
         for bag in bags:

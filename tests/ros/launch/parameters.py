@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters of the started nodes: by rig.toml, and by arguments, which win.
+"""Parameters of the launched nodes: from rig.toml and from arguments, which take precedence.
 
-The nodes stay unconfigured, for a lifecycle manager, and are asked for what they were given.
+The nodes stay unconfigured, as for a lifecycle manager, and are asked for their parameters.
 """
 
 import shutil
@@ -27,7 +27,7 @@ angle_joint = {front = "x", side = "y"}
 angle_max_age = 2
 """
 PHANTOM = FOLDER / 'other.csv'
-CASES = {  # arguments, and what the nodes say: fluoroscopes, phantom, joint, longest age
+CASES = {  # arguments, and expected values: fluoroscopes, phantom, joint, maximum age
     'rig': (
         {'rig': FOLDER / 'rig.toml'},
         ['front', 'side'],
@@ -48,7 +48,7 @@ CASES = {  # arguments, and what the nodes say: fluoroscopes, phantom, joint, lo
 
 @launch_testing.parametrize('case', list(CASES))
 def generate_test_description(case):
-    """Start all nodes that know an angle, and the reconstruction node, which does not."""
+    """Start all nodes that use the joint angle, and the reconstruction node, which does not."""
     (FOLDER / 'rig.toml').write_text(RIG)
     for name in ('cube.csv', PHANTOM.name):
         shutil.copy(BAGS / 'phantom.csv', FOLDER / name)
@@ -71,22 +71,22 @@ def generate_test_description(case):
 
 
 class TestNodes(unittest.TestCase):
-    """While the nodes run."""
+    """Tests that run while the nodes are up."""
 
     @classmethod
     def setUpClass(cls):
-        """Make a node that asks the others."""
+        """Create a node that queries the others."""
         rclpy.init(args=[])
         cls.node = rclpy.create_node('asker')
 
     @classmethod
     def tearDownClass(cls):
-        """Destroy it."""
+        """Destroy the querying node."""
         cls.node.destroy_node()
         rclpy.shutdown()
 
     def value(self, node, name):
-        """Return the value of a parameter; asked again, for a first answer may be lost."""
+        """Return the value of a parameter; ask again, since the first answer may be lost."""
         client = AsyncParameterClient(self.node, node)
         end = time.monotonic() + DEADLINE
         while time.monotonic() < end:
@@ -98,7 +98,7 @@ class TestNodes(unittest.TestCase):
         return self.fail(f'{node} did not answer')
 
     def test_parameters_reach_every_node_that_needs_them(self, expected):
-        """The joint, also the recorder node."""
+        """The joint also reaches the recorder node."""
         for name, nodes in (
             ('fluoroscopes', (*WITH_NAMES, 'reconstruction_node')),
             ('phantom', WITH_PHANTOM),
@@ -112,14 +112,14 @@ class TestNodes(unittest.TestCase):
 
 @launch_testing.post_shutdown_test()
 class TestEnd(unittest.TestCase):
-    """After launch has interrupted the nodes."""
+    """Tests that run after launch has interrupted the nodes."""
 
     def test_all_nodes_end_cleanly(self, proc_info):
-        """Exit status 0."""
+        """Every exit status is 0."""
         launch_testing.asserts.assertExitCodes(proc_info)
 
     def test_reconstruction_node_is_given_no_joint(self, proc_info):
-        """Its last parameter file is what launch wrote from the arguments."""
+        """The last parameter file of the node is the one that launch wrote from the arguments."""
         (command,) = (one.cmd for one in proc_info if 'reconstruction_node' in one.process_name)
         given = Path(command[-1]).read_text()
         self.assertIn('calibration_directory', given)

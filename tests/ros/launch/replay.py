@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bag is replayed with the time of its recording, which the player publishes."""
+"""Replay a bag with the recorded time, which the player publishes."""
 
 import time
 import unittest
@@ -26,10 +26,10 @@ def generate_test_description():
 
 
 class TestNodes(unittest.TestCase):
-    """While the bag is played."""
+    """Tests that run while the bag is played."""
 
     def test_diagnostics_of_all_nodes_have_the_time_of_the_recording(self):
-        """None falls silent, and none says that its clock stands."""
+        """No node falls silent or reports that its clock has stopped."""
         stamps = {}
         faults = []
 
@@ -57,8 +57,8 @@ class TestNodes(unittest.TestCase):
 
 @launch_testing.post_shutdown_test()
 class TestEnd(unittest.TestCase):
-    """After launch has interrupted the nodes."""
+    """Tests that run after launch has interrupted the nodes."""
 
     def test_all_nodes_end_cleanly(self, proc_info):
-        """Exit status 0."""
+        """Every exit status is 0."""
         launch_testing.asserts.assertExitCodes(proc_info)

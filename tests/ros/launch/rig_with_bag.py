@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A rig in a namespace: a bag is played, exposures are collected, and all is recorded.
+"""A rig in a namespace plays a bag, collects exposures and records everything.
 
-The parameter file sets a pattern for all nodes, which launch arguments take precedence over.
+The parameter file sets a pattern for all nodes; launch arguments take precedence over it.
 """
 
 import unittest
@@ -17,7 +17,7 @@ TOPICS = [f'/launched/{name}/target_observations' for name in 'ab']
 
 
 def generate_test_description():
-    """Start the nodes of a rig with player and recorder."""
+    """Start the nodes of a rig with a player and a recorder."""
     parameters = FOLDER / 'parameters.yaml'
     parameters.write_text(
         "/**:\n  ros__parameters:\n    phantom: ''\n    collect: still\n    still_time: 0.2\n"
@@ -36,10 +36,10 @@ def generate_test_description():
 
 
 class TestNodes(unittest.TestCase):
-    """While the nodes run."""
+    """Tests that run while the nodes are up."""
 
     def test_exposures_are_collected_and_recorded(self, proc_output, proc_info):
-        """All of the bag: the player waits for readers, and the recorder is one of them."""
+        """The whole bag is collected: the player waits for its readers, including the recorder."""
         for topic in TOPICS:
             proc_output.assertWaitFor(f'recording {topic}', timeout=DEADLINE, stream='stderr')
         proc_output.assertWaitFor('exposure 15 collected', timeout=DEADLINE, stream='stderr')
@@ -48,15 +48,15 @@ class TestNodes(unittest.TestCase):
 
 @launch_testing.post_shutdown_test()
 class TestEnd(unittest.TestCase):
-    """After launch has interrupted the nodes."""
+    """Tests that run after launch has interrupted the nodes."""
 
     def test_all_nodes_end_cleanly(self, proc_info, proc_output):
-        """Exit status 0 and no traceback."""
+        """Every exit status is 0, and there is no traceback."""
         launch_testing.asserts.assertExitCodes(proc_info)
         assert not any(b'Traceback' in one.text for one in proc_output)
 
     def test_recorded_bag_is_complete(self):
-        """It holds every frame of the bag that was played."""
+        """The recorded bag holds every frame of the bag that was played."""
         found = read_frames(FOLDER / 'recorded').frames
         played = read_frames(BAGS / 'calibration').frames
         counts = {name: len(frames) for name, frames in found.items()}

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""RViz is started with the shipped configuration and the rig frame.
+"""RViz starts with the shipped configuration and the rig frame.
 
-RViz needs a display, so a program of its name that prints its arguments takes its place.
+RViz needs a display, so a program of the same name that prints its arguments replaces it.
 """
 
 import os
@@ -14,7 +14,7 @@ from shipped import DEADLINE, FOLDER, rig
 
 
 def generate_test_description():
-    """Start a rig without calibration node, paused, with another rviz2."""
+    """Start a rig without a calibration node, paused, with the replacement for rviz2."""
     prefix = FOLDER / 'prefix'
     program = prefix / 'lib' / 'rviz2' / 'rviz2'
     index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages' / 'rviz2'
@@ -28,7 +28,7 @@ def generate_test_description():
 
 
 class TestRviz(unittest.TestCase):
-    """While the nodes run."""
+    """Tests that run while the nodes are up."""
 
     def test_arguments(self, proc_output):
         """The configuration exists, and the fixed frame is that of the rig."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The shipped launch files with arguments, as part of a launch test."""
+"""The shipped launch files with arguments, for use in a launch test."""
 
 import os
 from pathlib import Path
@@ -13,12 +13,12 @@ from launch_testing.actions import ReadyToTest
 
 ROOT = Path(__file__).resolve().parents[3]
 BAGS = ROOT / 'bags'
-FOLDER = Path(os.environ['LAUNCH_TEST_FOLDER'])  # of files that a test writes
+FOLDER = Path(os.environ['LAUNCH_TEST_FOLDER'])  # for files written by a test
 DEADLINE = 60.0  # seconds
 
 
 def rig(name='fluoro_calib', /, **arguments):
-    """Return a LaunchDescription of a shipped launch file, whose tests begin at once."""
+    """Return a LaunchDescription of a shipped launch file whose tests begin immediately."""
     source = PythonLaunchDescriptionSource(str(ROOT / 'launch' / f'{name}.launch.py'))
     return LaunchDescription(
         [

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 // SPDX-License-Identifier: Apache-2.0
 
-// Declarations of what examples/motion_tracking_node.cpp uses of rclcpp (Jazzy), for compiling it where
-// rclcpp is not installed: it has no wheel. Nothing is defined, so nothing can be linked.
+// Declarations of the parts of rclcpp (Jazzy) that examples/motion_tracking_node.cpp uses, to compile it
+// where rclcpp is not installed: it has no wheel. Nothing is defined, so nothing can be linked.
 
 #ifndef RCLCPP__RCLCPP_HPP_
 #define RCLCPP__RCLCPP_HPP_

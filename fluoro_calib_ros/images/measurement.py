@@ -572,14 +572,14 @@ def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         before = imaging.profile
         step = (right + weight * (first - before.scatter)) / (information + weight)
         known = before.with_scatter(float(np.clip(before.scatter + step, LOW[3], HIGH[3])))
+        if abs(known.scatter - before.scatter) < SCATTER_STEP:
+            break
         profile = _typical(light, shadows, imaging.size, before.radius_px, known)
         changed = replace(imaging, profile=profile)
         fit, changed_lack = fitted(changed)
         if np.mean(np.log(changed_lack / lack)) > 0:
             break
         imaging, lack = changed, changed_lack
-        if abs(known.scatter - before.scatter) < SCATTER_STEP:
-            break
     return imaging
 
 

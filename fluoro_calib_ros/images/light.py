@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from itertools import product
 
 import cv2
@@ -37,6 +38,12 @@ MIN_PIXELS = 1000  # pixels that estimates of noise and correlation need
 MAX_SLOW = 0.9  # largest share of slow changes; beyond it the noise is not visible
 
 
+# Width of the blur of scattered light, relative to the image. Scattered light spreads over some
+# centimetres in a field of 20 to 40 cm.
+SURROUNDINGS = 1 / 16
+STRIDE = 8  # pixels over which that light hardly changes
+
+
 @dataclass(frozen=True)
 class Light:
     """Grey values of an image that has dark beads."""
@@ -46,6 +53,20 @@ class Light:
     #: grey values at which the image is clipped: less, or more, light does not change them
     low: float = -np.inf
     high: float = np.inf
+
+    def around(self, uv: NDArray[np.float64]) -> NDArray[np.floating]:
+        """Return the mean light (n,) in the surroundings of pixels (n, 2)."""
+        column, row = np.rint(np.asarray(uv).T / STRIDE - 0.5 + 0.5 / STRIDE).astype(int)
+        height, width = self._surroundings.shape
+        return self._surroundings[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+
+    @cached_property
+    def _surroundings(self) -> NDArray[np.float32]:
+        """Light blurred as scattered light is, at every STRIDE-th pixel."""
+        size = [-(-side // STRIDE) for side in self.grey.shape[::-1]]
+        small = cv2.resize(self.grey, size, interpolation=cv2.INTER_AREA)
+        width = SURROUNDINGS * max(small.shape)
+        return cv2.GaussianBlur(small, (0, 0), width, borderType=cv2.BORDER_REPLICATE)
 
 
 def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:

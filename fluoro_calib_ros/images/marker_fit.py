@@ -188,30 +188,28 @@ class _MarkerFit(ShadowFit):
         """Return light (g, m) and its derivatives (g, OWN + 3 k, m)."""
         members = np.concatenate([rows[:, None], near], axis=1)
         shadow, by_u, by_v = self._shadow(members, self.middle[rows])
-        scatter = self.profile.scatter
-        plane = self._plane(rows)
+        direct = self._direct(rows)
         if not near.shape[1]:  # the same in fewer operations
             depth = self.depth[rows, None]
-            relative = 1 - (1 - scatter) * np.minimum(depth * shadow[:, 0], 1 - MIN_PASSED)
-            jacobian = self._jacobian(relative, 1)
-            by_shadow = (scatter - 1) * plane
-            by_place = by_shadow * depth
+            behind = direct * np.maximum(1 - depth * shadow[:, 0], MIN_PASSED)
+            jacobian = self._jacobian(rows, behind, 1)
+            by_place = -direct * depth
             np.multiply(by_place, by_u[:, 0], out=jacobian[:, TERMS])
             np.multiply(by_place, by_v[:, 0], out=jacobian[:, TERMS + 1])
-            np.multiply(by_shadow, shadow[:, 0], out=jacobian[:, TERMS + 2])
-            return plane * relative, jacobian
+            np.multiply(-direct, shadow[:, 0], out=jacobian[:, TERMS + 2])
+            return self._scattered(rows) + behind, jacobian
         exists = members >= 0
         depth = np.where(exists, self.depth[members], 0.0)[..., None]
         passed = np.maximum(1 - depth * shadow, MIN_PASSED)
         product = np.prod(passed, axis=1)
-        relative = scatter + (1 - scatter) * (product + self._crossing_in(rows))
-        jacobian = self._jacobian(relative, members.shape[1])
-        by_shadow = -(1 - scatter) * (plane * product)[:, None] / passed
+        behind = direct * (product + self._crossing_in(rows))
+        jacobian = self._jacobian(rows, behind, members.shape[1])
+        by_shadow = -(direct * product)[:, None] / passed
         by_place = by_shadow * depth
         jacobian[:, TERMS::3] = by_place * by_u
         jacobian[:, TERMS + 1 :: 3] = by_place * by_v
         jacobian[:, TERMS + 2 :: 3] = by_shadow * shadow * exists[..., None]
-        return plane * relative, jacobian
+        return self._scattered(rows) + behind, jacobian
 
     def _disturbed(
         self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool

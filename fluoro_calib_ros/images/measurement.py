@@ -231,7 +231,8 @@ class _BeadFit(ShadowFit):
         grey = light.grey[row, column].astype(np.float32)
         self.low = light.low
         self.high = light.high
-        self._set_windows(grey, valid & own, bright=np.where(valid, grey, 0.0))
+        bright = np.where(valid, grey, 0.0)
+        self._set_windows(grey, valid & own, bright=bright, around=light.around(self.uv))
         self.usable = self.valid.sum(axis=1) >= MIN_INSIDE * own.sum(axis=1)
         # If part of the border is missing, a shadow that is not quite that of a sphere moves.
         from_edge = np.minimum(self.uv, (width - 1, height - 1) - self.uv).min(axis=1)
@@ -342,18 +343,15 @@ class _BeadFit(ShadowFit):
         depth = self.depth[everyone].astype(np.float32)[..., None]
         passed = np.maximum(1 - depth * shadow, np.float32(MIN_PASSED))
         product = np.prod(passed, axis=1)
-        transmitted = np.float32(1 - self.profile.scatter)
-        plane = self._plane(rows)
-        relative = np.float32(self.profile.scatter) + transmitted * (
-            product + self._crossing_in(rows)
-        )
-        by_shadow = (-transmitted * plane * product)[:, None] / passed
+        direct = self._direct(rows)
+        behind = direct * (product + self._crossing_in(rows))
+        by_shadow = (-direct * product)[:, None] / passed
         by_distance = -by_shadow * depth * slope
-        jacobian = self._jacobian(relative, everyone.shape[1])
+        jacobian = self._jacobian(rows, behind, everyone.shape[1])
         np.multiply(by_distance, by_x, out=jacobian[:, TERMS::3])
         np.multiply(by_distance, by_y, out=jacobian[:, TERMS + 1 :: 3])
         np.multiply(by_shadow, shadow, out=jacobian[:, TERMS + 2 :: 3])
-        return plane * relative, jacobian
+        return self._scattered(rows) + behind, jacobian
 
     def _disturbed(
         self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
@@ -408,16 +406,19 @@ class _BeadFit(ShadowFit):
 
     def absorbed(self) -> Absorbed:
         """Return the light absorbed by beads, in the pixels of beads with a good fit."""
-        plane = self._plane(np.arange(len(self.uv)))
+        every = np.arange(len(self.uv))
+        plane = self._direct(every) + self._scattered(every)
         x, y = np.moveaxis(self.middle[:, None] + self.offset - self.uv[:, None], 2, 0)
-        distance = np.sqrt(self._squared(np.arange(len(self.uv)), x, y))
+        distance = np.sqrt(self._squared(every, x, y))
         known = self.valid & (self.grey > self.low) & (self.grey < self.high)
         good = (
             known & (self.measured & (self.misfit < UNDISTURBED * np.median(self.misfit)))[:, None]
         )
         weight = plane / np.maximum(np.median(plane), 1e-9)
         size = np.broadcast_to(rounded(self.size, 1 + RADIUS_SD)[:, None], good.shape)
-        return Absorbed(distance[good], (1 - self.grey / plane)[good], weight[good], size[good])
+        share = 1 - self.grey / plane
+        around = self.around[:, None] / plane
+        return Absorbed(*(one[good] for one in (distance, share, weight, size, around)))
 
     def result(self) -> Beads:
         """Return the measured beads."""
@@ -621,16 +622,16 @@ def _by_scatter(
 ) -> NDArray[np.floating]:
     """Return derivatives (g, m) of light by the share s of scattered light.
 
-    Let beads absorb shares x of the direct light, and keep (1 - s) x. Then the derivative of
-    s + (1 - s) prod(1 - x) is 1 - prod(1 - x) (1 + sum(x / (1 - x))): for one bead it is 0,
-    for two beads the product of both x.
+    Let the light without beads and the light behind one bead stay the same. If beads absorb shares
+    x of the direct light, the derivative, over the light of the surroundings, is
+    1 - prod(1 - x) (1 + sum(x / (1 - x))): for one bead it is 0, for two beads the product of
+    both x.
     """
     depth = fit.depth[np.concatenate([rows[:, None], near], axis=1)][..., None]
-    scatter = fit.profile.scatter
-    plane = fit._plane(rows)
-    passed = (light - scatter * plane) / (1 - scatter)
-    by_depth = (depth * jacobian[:, TERMS + 2 :: 3]).sum(axis=1) / (1 - scatter)
-    return plane * (1 + 2 * fit._crossing_in(rows)) - passed + by_depth
+    direct = fit._direct(rows)
+    passed = (light - fit._scattered(rows)) / direct
+    by_depth = (depth * jacobian[:, TERMS + 2 :: 3]).sum(axis=1) / direct
+    return fit.around[rows, None] * (1 + 2 * fit._crossing_in(rows) - passed + by_depth)
 
 
 def _overlapping(

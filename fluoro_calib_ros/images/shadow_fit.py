@@ -3,9 +3,10 @@
 
 """Fit blurred shadows of spheres to the grey values of windows: common part of all such fits.
 
-The background of a window around a bead is a polynomial of degree 2. Neighbours that reach into
-the window are fitted as well, so the standard deviation of a centre includes the uncertainty due
-to overlap. All windows of an image take their Gauss-Newton steps at once.
+The light of a window without beads is direct light, whose logarithm is a polynomial of degree 2,
+and scattered light, which is constant and not attenuated by beads. Neighbours that reach into the
+window are fitted as well, so the standard deviation of a centre includes the uncertainty due to
+overlap. All windows of an image take their Gauss-Newton steps at once.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import product
 
 import cv2
 import numpy as np
@@ -35,6 +37,9 @@ DEPTH_SD = 1.0  # prior standard deviation of the depth of a shadow, which is 1 
 DEPTHS = (0.05, 3.0)  # bounds of the depth; a shadow removes light
 MIN_PASSED = 0.02  # least share of the light behind a bead: derivatives are divided by it
 MIN_INSIDE = 0.6  # least share of a window inside the field
+MIN_DIRECT = 0.1  # least share of direct light in the light around a bead
+DARK = 1e-3  # grey value below which light cannot be told from none
+MAX_CHANGE = 1.0  # largest change of the logarithm of direct light in a step, for each term
 FINE = 3  # points per pixel of the grid on which shadows that touch are blurred
 OVERLAP = 0.85  # fraction of the sum of both reaches; shadows that are nearer overlap
 DISTURBED = 1.6  # relative lack of fit from which pixels with large residuals are down-weighted
@@ -162,7 +167,10 @@ class ShadowFit(ABC):
         x, y = (self.offset.T / window_px).astype(DTYPE)
         self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
         n = len(self.uv)
+        self.window_px = window_px
+        #: coefficients of the logarithm of the direct light
         self.background = np.zeros((n, TERMS))
+        self.around = np.zeros(n)  # light of the surroundings
         self.sigma = np.full(n, np.inf)  # of centres, for independent noise of the pixels [px]
         self.noise_sigma = np.full(n, np.inf)  # the part of it due to the noise
         self.correlation = noise.correlation
@@ -175,16 +183,28 @@ class ShadowFit(ABC):
         self.strength = np.zeros(n)  # strength of the background beyond the polynomial
         self.groups: list[Group] = []
 
-    def _set_windows(self, grey: np.ndarray, valid: np.ndarray, bright: np.ndarray) -> None:
+    def _set_windows(
+        self,
+        grey: np.ndarray,
+        valid: np.ndarray,
+        bright: np.ndarray,
+        around: np.ndarray | None = None,
+    ) -> None:
         """Note the grey values (n, m) of the windows, and whether they are valid.
 
-        bright: grey values whose upper quartile is the initial background.
+        bright: grey values whose upper quartile is the initial light without beads. around: (n,)
+        light of the surroundings, None if it is the same.
         """
         self.grey = grey.astype(DTYPE)
         self.valid = valid
         self.usable = valid.mean(axis=1) >= MIN_INSIDE
         place = int(0.75 * len(self.offset))
-        self.background[:, 0] = np.partition(bright, place, axis=1)[:, place]
+        light = np.maximum(np.partition(bright, place, axis=1)[:, place], DARK)
+        self.around = light if around is None else np.maximum(around, DARK)
+        scatter = self.profile.scatter
+        if scatter:
+            self.around = np.minimum(self.around, (1 - MIN_DIRECT) / scatter * light)
+        self.background[:, 0] = np.log(light - scatter * self.around)
 
     def _set_groups(self, near: np.ndarray) -> None:
         """Group beads by the number of their neighbours near (n, k), -1 for none, nearest first.
@@ -219,20 +239,29 @@ class ShadowFit(ABC):
 
     # ---- parts of the model
 
-    def _plane(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the light (g, m) in windows without beads."""
-        background = self.background[rows].astype(DTYPE)
-        plane = background @ self.basis.T
-        return np.maximum(plane, 1e-3 * np.abs(background[:, :1]) + 1e-6)
+    def _direct(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the direct light (g, m) in windows without beads."""
+        return np.exp(self.background[rows].astype(DTYPE) @ self.basis.T)
+
+    def _scattered(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the scattered light (g, 1) in windows."""
+        return DTYPE(self.profile.scatter) * self.around[rows, None].astype(DTYPE)
 
     def _crossing_in(self, rows: NDArray[np.int64]) -> np.ndarray:
         """Return how shadows that touch differ, in windows, from the product of both shadows."""
         return DTYPE(0) if self.crossing is None else self.crossing[rows]
 
-    def _jacobian(self, relative: NDArray[np.floating], beads: int) -> NDArray[np.float32]:
-        """Return derivatives (g, TERMS + 3 beads, m) of which only the background's are set."""
-        shape = (len(relative), TERMS + 3 * beads, len(self.offset))
+    def _jacobian(
+        self, rows: NDArray[np.int64], passed: NDArray[np.floating], beads: int
+    ) -> NDArray[np.float32]:
+        """Return derivatives (g, TERMS + 3 beads, m) of which only the background's are set.
+
+        passed: (g, m) direct light behind beads. The unit of a change of the background is the
+        direct light in the middle of the window.
+        """
+        shape = (len(rows), TERMS + 3 * beads, len(self.offset))
         jacobian = np.empty(shape, dtype=DTYPE)
+        relative = passed * np.exp(-self.background[rows, :1]).astype(DTYPE)
         np.multiply(relative[:, None], self.basis.T, out=jacobian[:, :TERMS])
         return jacobian
 
@@ -249,10 +278,11 @@ class ShadowFit(ABC):
         )
         step = np.where(self.usable[rows][:, None], step, 0)
         longest = self.settings.max_step_px
+        relative = step[:, :TERMS] * np.exp(-self.background[rows, :1])
         return (
             self.uv[rows] + _within(step[:, TERMS : TERMS + 2], -longest, longest),
             _within(self.depth[rows] + step[:, TERMS + 2], *DEPTHS),
-            self.background[rows] + step[:, :TERMS],
+            self.background[rows] + _within(relative, -MAX_CHANGE, MAX_CHANGE),
         )
 
     def _equations(self, group: Group, final: bool, usual: float | None) -> NormalEquations:
@@ -422,14 +452,25 @@ class ShadowFit(ABC):
         touching = self.distance < 2 * self.profile.radius_px
         factor = np.where(touching, self.settings.crossed * factor, factor)
         return Beads(
-            self.uv.copy(),
+            self.uv + self._drawn(),
             np.sqrt(self.sigma**2 + by_correlation) * factor,
             depth=self.depth.copy(),
-            light=self.background[:, 0].copy(),
+            light=np.exp(self.background[:, 0]) + self.profile.scatter * self.around,
             misfit=self.misfit / max(typical, 1e-12),
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,
         )
+
+    def _drawn(self) -> NDArray[np.float64]:
+        """Return how far (n, 2) blur has drawn shadows towards less light [px].
+
+        If direct light is proportional to exp(g x), a shadow that a Gaussian of variance s^2 blurs
+        with it appears at x - g s^2 (complete the square in the convolution).
+        """
+        x, y = ((self.uv - self.middle) / self.window_px).T
+        _, by_x, by_y, by_xx, by_xy, by_yy = self.background.T
+        gradient = [by_x + 2 * by_xx * x + by_xy * y, by_y + by_xy * x + 2 * by_yy * y]
+        return np.column_stack(gradient) * (self.profile.variance_px2 / self.window_px)
 
 
 def _within(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
@@ -469,6 +510,8 @@ HIGH = (40.0, 6.0, 6.0, 0.6)
 MAX_ABSORBED = float(-np.expm1(-2 * HIGH[2]))  # share of the direct light
 CHANGE = 1.5  # largest factor on the first three in one fit
 RING_PX = 0.25  # width of the rings to whose means a profile is fitted
+AROUND_STEP = 1.5  # ratio of shares of the surrounding light in rings that are kept apart
+CLASSES = 4  # largest number of such steps
 
 
 @dataclass(frozen=True)
@@ -484,6 +527,11 @@ class Profile:
     def reach_px(self) -> float:
         """Distance from the centre at which the shadow ends [px]."""
         return self.radius_px + REACH_SIGMAS * self.blur_px
+
+    @property
+    def variance_px2(self) -> float:
+        """Variance of the blur, including that of a square pixel, 1/12 [px^2]."""
+        return self.blur_px**2 + 1 / 12
 
     @cached_property
     def border_px(self) -> float:
@@ -578,9 +626,9 @@ class _Blurred:
     def __init__(self, profile: Profile) -> None:
         self._parts = max(1, int(min(STEP, profile.radius_px / 4) / TABLE_STEP))
         step = self._parts * TABLE_STEP
-        # The blur of a square pixel has a variance of 1/12. Only the row through the centre is
-        # needed: all columns are weighted to one row, which is blurred along itself.
-        self.sigma = float(np.sqrt(profile.blur_px**2 + 1 / 12))
+        # Only the row through the centre is needed: all columns are weighted to one row, which is
+        # blurred along itself.
+        self.sigma = float(np.sqrt(profile.variance_px2))
         half = int(np.ceil(KERNEL_SIGMAS * self.sigma / step)) + 1
         count = max(int(np.ceil((profile.reach_px + 3) / step)) + 4, half + 1)
         self._axis = np.arange(count) * step
@@ -651,23 +699,25 @@ class Absorbed:
     share: NDArray[np.floating]  #: (n,), absorbed share of the light
     weight: NDArray[np.floating]  #: (n,)
     size: NDArray[np.float64]  #: (n,), relative sizes of the beads, with few different values
+    around: NDArray[np.floating]  #: (n,), light of the surroundings over that without beads
 
     def binned(self, profile: Profile) -> Iterator[_Binned]:
-        """Yield means over rings for the beads of each size, up to the reach of the profile."""
-        for size in np.unique(self.size):
-            own = self.size == size
+        """Yield means over rings, up to the reach of the profile.
+
+        Beads are separated by size, and their pixels by the share of the surrounding light.
+        """
+        share = np.clip(np.rint(np.log(self.around) / np.log(AROUND_STEP)), -CLASSES, CLASSES)
+        for size, class_ in product(np.unique(self.size), np.unique(share)):
+            own = (self.size == size) & (share == class_)
             edges = np.arange(0, profile.sized(float(size)).reach_px + 1, RING_PX)
             cell = np.digitize(self.distance[own], edges)
+            values = (np.ones(1), self.share[own], self.distance[own], self.around[own])
             sums = [
-                np.bincount(cell, weights=one, minlength=len(edges) + 1)[1:-1]
-                for one in (
-                    self.weight[own],
-                    self.weight[own] * self.share[own],
-                    self.weight[own] * self.distance[own],
-                )
+                np.bincount(cell, weights=self.weight[own] * one, minlength=len(edges) + 1)[1:-1]
+                for one in values
             ]
-            total, share, distance = np.array(sums)[:, sums[0] > 0]
-            yield _Binned(float(size), distance / total, share / total, np.sqrt(total))
+            total, *means = np.array(sums)[:, sums[0] > 0]
+            yield _Binned(float(size), np.sqrt(total), *(mean / total for mean in means))
 
 
 @dataclass(frozen=True)
@@ -675,20 +725,22 @@ class _Binned:
     """Mean absorbed shares (n,) of beads of a size in rings at mean distances (n,) [px]."""
 
     size: float
-    distance: NDArray[np.float64]
-    share: NDArray[np.float64]
     root: NDArray[np.float64]  #: (n,), square roots of the weights
+    share: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    around: NDArray[np.float64]  #: (n,), light of the surroundings over that without beads
 
     def residual(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return weighted residuals (n,) for radius, blur, attenuation and scatter."""
         value, _ = Profile(*unknowns[:3]).sized(self.size).shadow(self.distance)
-        return self.root * ((1 - unknowns[3]) * value - self.share)
+        return self.root * ((1 - unknowns[3] * self.around) * value - self.share)
 
     def slopes(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return derivatives (n, 4) of the residuals."""
         profile = Profile(*unknowns[:3]).sized(self.size)
-        by_shape = (1 - unknowns[3]) * shadow_derivatives(profile, self.distance)
-        by_scatter = -profile.shadow(self.distance)[0]
+        direct = 1 - unknowns[3] * self.around
+        by_shape = direct[:, None] * shadow_derivatives(profile, self.distance)
+        by_scatter = -self.around * profile.shadow(self.distance)[0]
         columns = np.column_stack([by_shape * (self.size, 1.0, self.size), by_scatter])
         return self.root[:, None] * columns
 

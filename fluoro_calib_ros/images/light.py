@@ -16,7 +16,7 @@ normal equations, so standard deviations include the uncertainty of the backgrou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import product
 
@@ -235,6 +235,9 @@ HIGHEST = 9  # highest number of half waves across a window
 # strength: they contain 0.9 of its variance.
 TELLING = 26
 EXPONENT = 3.0
+# Variance of the waves across a straight edge, relative to that of other waves of their length. In
+# eight renderings with plates, errors were the same to 1 % with 30 and 300.
+EDGE = 100.0
 POLYNOMIAL = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of x and y
 # Ratios of the variance of the background to that of the noise that are compared. The likelihood
 # is wider than their steps: 20 cosines determine the strength to a factor of 1.4.
@@ -254,12 +257,20 @@ def vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
 class Cosines:
     """Cosines on the pixels of a window, and their variances.
 
-    offset: (m, 2) pixels relative to the middle of the window.
+    offset: (m, 2) pixels relative to the middle of the window. across: direction across a straight
+    edge [rad], in which the background changes more; None for a background without an edge.
     """
 
-    def __init__(self, offset: NDArray[np.int64], dtype: type[np.floating]) -> None:
+    def __init__(
+        self,
+        offset: NDArray[np.int64],
+        dtype: type[np.floating],
+        across: float | None = None,
+    ) -> None:
         half = float(np.abs(offset).max()) + 0.5
-        x, y = (offset.T + half) * (np.pi / (2 * half))
+        angle = across or 0.0
+        turned = offset @ [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        x, y = (turned.T + half) * (np.pi / (2 * half))
         number = np.array(
             [
                 (i, j)
@@ -271,6 +282,8 @@ class Cosines:
             np.cos(np.outer(number[:, 0], x)) * np.cos(np.outer(number[:, 1], y))
         ).astype(dtype)
         power = np.sum(number**2, axis=1) ** (-EXPONENT / 2)
+        if across is not None:
+            power[number[:, 1] == 0] *= EDGE
         # Scaled so that a background of unit strength has unit variance at a pixel.
         self.variance = power / (power @ np.mean(self.waves**2, axis=1))
         polynomial, _ = np.linalg.qr(np.stack([x**i * y**j for i, j in POLYNOMIAL], axis=1))
@@ -338,6 +351,15 @@ class Cosines:
 
 
 @dataclass(frozen=True)
+class Strengths:
+    """Strengths of the backgrounds of windows (g,)."""
+
+    variance: NDArray[np.float64]  #: (g,), variances of the backgrounds, 0 for none
+    evidence: NDArray[np.float64]  #: (g,), log-evidence for a background
+    scale: float  #: factor on the noise
+
+
+@dataclass(frozen=True)
 class Spectra:
     """Residuals of windows (g,), projected on the components of the background."""
 
@@ -355,13 +377,13 @@ class Spectra:
             **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         )
 
-    def strengths(self, excess: float) -> NDArray[np.float64]:
-        """Return variances (g,) of the backgrounds, 0 for windows that more likely have none.
+    def strengths(self, excess: float) -> Strengths:
+        """Return the variances of the backgrounds, 0 for windows that more likely have none.
 
         The share of windows with a background and a common factor on the noise are estimated with
         the strengths. excess: variance of slow waves of the noise over that of white noise.
         """
-        log_det, explained = np.stack([self._marginal(ratio / excess) for ratio in RATIOS], axis=1)
+        log_det, explained = self._marginals(excess)
         squared = self.products[:, -1, -1]
         window = np.arange(len(squared))
         likely = np.zeros(len(squared), dtype=bool)
@@ -371,11 +393,30 @@ class Spectra:
             scale = float(np.median(mean_square))
             gain = 0.5 * (explained / (scale * excess) - log_det)
             best = np.argmax(gain, axis=0)
-            likely = _likely(logsumexp(gain, axis=0) - np.log(len(RATIOS)))
+            likely = _likely(_evidence(gain))
+        strengths = self._most_likely(gain, scale)
+        return replace(strengths, variance=np.where(likely, strengths.variance, 0.0))
+
+    def strengths_at(self, excess: float, scale: float) -> Strengths:
+        """Return the variances of the backgrounds of windows that have one.
+
+        scale: factor on the noise.
+        """
+        log_det, explained = self._marginals(excess)
+        return self._most_likely(0.5 * (explained / (scale * excess) - log_det), scale)
+
+    def _most_likely(self, gain: NDArray[np.float64], scale: float) -> Strengths:
+        """Return the most likely variances, given log-likelihoods (r, g) at the ratios."""
+        best = np.argmax(gain, axis=0)
         inner = np.clip(best, 1, len(RATIOS) - 2)
+        window = np.arange(len(best))
         offset = vertex(*(gain[inner + step, window] for step in (-1, 0, 1)))
         ratio = RATIOS[best] * np.where(inner == best, STEP**offset, 1.0)
-        return np.where(likely, ratio * self.noise, 0.0)
+        return Strengths(ratio * self.noise, _evidence(gain), scale)
+
+    def _marginals(self, excess: float) -> NDArray[np.float64]:
+        """Return log-determinants and explained squared residuals (2, r, g) at the ratios."""
+        return np.stack([self._marginal(ratio / excess) for ratio in RATIOS], axis=1)
 
     def _marginal(self, ratio: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return log-determinants (g,) and the squared residuals that a background explains."""
@@ -385,6 +426,11 @@ class Spectra:
         pivot = np.linalg.cholesky(matrix)[:, diagonal, diagonal]
         unexplained = (pivot[:, -1] ** 2 - 1) / ratio
         return 2 * np.log(pivot[:, :-1]).sum(axis=1), self.products[:, -1, -1] - unexplained
+
+
+def _evidence(gain: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return log-evidence (g,) from log-likelihoods (r, g) at equally probable ratios."""
+    return np.asarray(logsumexp(gain, axis=0) - np.log(len(RATIOS)))
 
 
 def _likely(evidence: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -236,8 +236,9 @@ HIGHEST = 9  # highest number of half waves across a window
 TELLING = 26
 EXPONENT = 3.0
 # Variance of the waves across a straight edge, relative to that of other waves of their length. In
-# eight renderings with plates, errors were the same to 1 % with 30 and 300.
-EDGE = 100.0
+# eight renderings with plates, errors were the same to 2 % with 10 to 300; the larger, the smaller
+# were their standard deviations.
+EDGE = 30.0
 POLYNOMIAL = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of x and y
 # Ratios of the variance of the background to that of the noise that are compared. The likelihood
 # is wider than their steps: 20 cosines determine the strength to a factor of 1.4.

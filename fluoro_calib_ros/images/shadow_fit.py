@@ -39,6 +39,11 @@ MIN_PASSED = 0.02  # least share of the light behind a bead: derivatives are div
 MIN_INSIDE = 0.6  # least share of a window inside the field
 MIN_DIRECT = 0.1  # least share of direct light in the light around a bead
 DARK = 1e-3  # grey value below which light cannot be told from none
+# Share of the blur that draws shadows towards less light, and its standard deviation. That of the
+# detector does. That of the focal spot does if the light changes at the depth of the bead, but
+# not if it changes in the beam. The share is between a half and one.
+DRAWN = 0.75
+DRAWN_SD = 0.5 / np.sqrt(12)
 MAX_CHANGE = 1.0  # largest change of the logarithm of direct light in a step, for each term
 # Directions across edges that are tried, 7.5 degrees apart: at the border of a window, an edge is
 # then off by less than its blur. NO_EDGE: the background has no straight edge.
@@ -496,9 +501,11 @@ class ShadowFit(ABC):
         # Where shadows touch, the model errs by more than the noise of the pixels suggests.
         touching = self.distance < 2 * self.profile.radius_px
         factor = np.where(touching, self.settings.crossed * factor, factor)
+        sigma = np.sqrt(self.sigma**2 + by_correlation) * factor
+        drawn = self._drawn()
         return Beads(
-            self.uv + self._drawn(),
-            np.sqrt(self.sigma**2 + by_correlation) * factor,
+            self.uv + DRAWN * drawn,
+            np.hypot(sigma, DRAWN_SD * np.sqrt(0.5 * (drawn * drawn).sum(axis=1))),
             depth=self.depth.copy(),
             light=np.exp(self.background[:, 0]) + self.profile.scatter * self.around,
             misfit=self.misfit / max(typical, 1e-12),
@@ -507,7 +514,7 @@ class ShadowFit(ABC):
         )
 
     def _drawn(self) -> NDArray[np.float64]:
-        """Return how far (n, 2) blur has drawn shadows towards less light [px].
+        """Return how far (n, 2) blur draws shadows towards less light [px], as a shift back.
 
         If direct light is proportional to exp(g x), a shadow that a Gaussian of variance s^2 blurs
         with it appears at x - g s^2 (complete the square in the convolution).

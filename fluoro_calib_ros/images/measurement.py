@@ -27,6 +27,7 @@ from .shadow_fit import (
     MARGIN_PX,
     MIN_INSIDE,
     MIN_PASSED,
+    PLANE_TERMS,
     TERMS,
     UNDISTURBED,
     Absorbed,
@@ -199,7 +200,6 @@ class _BeadFit(ShadowFit):
         self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
         self.moved = np.zeros(len(uv))  # RMS shift of u and v by relative errors 1 of radii [px]
-        self.plane_only = False
         self.residual = np.zeros((len(uv), len(self.offset)), dtype=np.float32)  # at the last step
         self.counted = np.zeros(self.residual.shape, dtype=bool)
         self._set_groups(self._near(window + reach))
@@ -364,7 +364,7 @@ class _BeadFit(ShadowFit):
     def _prior(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.float64]:
         prior = super()._prior(rows, near)
         if self.plane_only:
-            prior[:, 3:TERMS] = HELD
+            prior[:, PLANE_TERMS:TERMS] = HELD
         return prior
 
     def _solve(

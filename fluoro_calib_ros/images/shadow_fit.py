@@ -28,6 +28,7 @@ MAX_SIGMA_PX = 0.3  # largest standard deviation of the centre of a visible shad
 MARGIN_PX = 2.0  # width of the background around the shadow
 DTYPE = np.float32  # type of model and derivatives
 TERMS = 6  # terms of the background, a polynomial of degree 2
+PLANE_TERMS = 3  # those of degree 1
 OWN = TERMS + 3  # unknowns of an isolated bead: its background, centre and depth
 # Prior standard deviations of a step of a neighbour: place and depth. With a smaller one for the
 # place, two beads that nearly coincide stay at their initial values.
@@ -44,7 +45,8 @@ DARK = 1e-3  # grey value below which light cannot be told from none
 # not if it changes in the beam. The share is between a half and one.
 DRAWN = 0.75
 DRAWN_SD = 0.5 / np.sqrt(12)
-MAX_CHANGE = 1.0  # largest change of the logarithm of direct light in a step, for each term
+LARGE = 0.1  # relative change of direct light that differs from that of its logarithm
+MAX_FACTOR = 20.0  # largest factor on the direct light in a step
 # Directions across edges that are tried, 7.5 degrees apart: at the border of a window, an edge is
 # then off by less than its blur. NO_EDGE: the background has no straight edge.
 DIRECTIONS = 24
@@ -189,6 +191,7 @@ class ShadowFit(ABC):
         self.low = -np.inf  # grey values at which the image is clipped
         self.high = np.inf
         self.crossing: np.ndarray | None = None
+        self.plane_only = False  # whether the background is a polynomial of degree 1
         self.strength = np.zeros(n)  # strength of the background beyond the polynomial
         self.across = np.full(n, NO_EDGE)  # direction across a straight edge in that background
         self._waves: dict[int, Cosines] = {}
@@ -289,12 +292,28 @@ class ShadowFit(ABC):
         )
         step = np.where(self.usable[rows][:, None], step, 0)
         longest = self.settings.max_step_px
-        relative = step[:, :TERMS] * np.exp(-self.background[rows, :1])
         return (
             self.uv[rows] + _within(step[:, TERMS : TERMS + 2], -longest, longest),
             _within(self.depth[rows] + step[:, TERMS + 2], *DEPTHS),
-            self.background[rows] + _within(relative, -MAX_CHANGE, MAX_CHANGE),
+            self.background[rows] + self._change(rows, step[:, :TERMS]),
         )
+
+    def _change(self, rows: NDArray[np.int64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the changes (g, TERMS) of backgrounds by a step of the direct light."""
+        change = step * np.exp(-self.background[rows, :1])
+        large = np.flatnonzero(np.abs(change).max(axis=1, initial=0.0) > LARGE)
+        if len(large):
+            # A change of the light by a large factor is not the same change of its logarithm.
+            factor = np.maximum(1 + change[large].astype(DTYPE) @ self.basis.T, 1 / MAX_FACTOR)
+            terms = len(self._of_terms)
+            change[large, :terms] = np.log(np.minimum(factor, MAX_FACTOR)) @ self._of_terms.T
+        return change
+
+    @cached_property
+    def _of_terms(self) -> NDArray[np.float32]:
+        """Matrix (t, m) that fits the terms that are estimated to the pixels of a window."""
+        basis = self.basis[:, :PLANE_TERMS] if self.plane_only else self.basis
+        return np.linalg.pinv(basis)
 
     def _equations(self, group: Group, final: bool, usual: float | None) -> NormalEquations:
         """Return normal equations of beads and note their lack of fit; usual: the typical one."""

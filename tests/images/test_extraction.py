@@ -174,12 +174,12 @@ def test_a_shadow_that_a_larger_one_hides_is_less_sure():
 
 
 def test_beads_that_overlap_in_clipped_light_are_less_sure():
-    """Only the inside of their shadows determines the radius; a bead alone is about as sure."""
+    """Only the inside of their shadows determines the radius; a bead alone is far surer."""
     beads = overlapping_beads(12.12)
     clipped = overlapping_beads(12.12, most=500.0)
     assert list(clipped.overlapped) == [True, True, False]
     assert clipped.sigma[:2].min() > 4 * beads.sigma[:2].max()
-    assert clipped.sigma[2] < 2 * beads.sigma[2]
+    assert clipped.sigma[2] < 3 * beads.sigma[2]
 
 
 def test_two_overlapping_beads_have_honest_sigmas():
@@ -248,7 +248,7 @@ def test_profile_is_fitted_to_its_shadow():
     true = Profile(3.4, 0.8, 1.3, 0.1)
     distance = np.random.default_rng(2).uniform(0, 6, 4000)
     share = 0.9 * true.shadow(distance)[0]
-    absorbed = Absorbed(distance, share, np.ones(4000), np.ones(4000))
+    absorbed = Absorbed(distance, share, *np.ones((3, 4000)))
     start = Profile(3.0, 1.0, 1.5, 0.1)
     for _ in range(10):  # each call makes a few steps only
         start = fit_profile(absorbed, start)

@@ -19,6 +19,7 @@ from fluoro_calib_ros.images import matching
 from fluoro_calib_ros.images.growth import Match
 from fluoro_calib_ros.images.light import (
     LAGS,
+    Light,
     Noise,
     _seen_by,
     clipped_at,
@@ -275,14 +276,15 @@ def test_clipped_values_are_more_frequent_than_those_beside():
 
 
 class Discs(ShadowFit):
-    """A fit with a linear model: a plane, and three given functions of each bead."""
+    """A fit with a linear model of beads: direct light, and three given functions of each bead."""
 
     def _model(self, rows, near):
-        g, k = near.shape
+        k = near.shape[1]
         rng = np.random.default_rng(7)
-        jacobian = self._jacobian(np.ones((g, len(self.offset)), np.float32), 1 + k)
+        direct = self._direct(rows)
+        jacobian = self._jacobian(rows, direct, 1 + k)
         jacobian[:, TERMS:] = rng.normal(size=jacobian[:, TERMS:].shape)
-        return self._plane(rows), jacobian
+        return self._scattered(rows) + direct, jacobian
 
     def _disturbed(self, rows, near, final):
         return np.zeros(len(rows), dtype=bool)
@@ -378,9 +380,9 @@ def test_steps_of_a_fit_are_those_of_weighted_least_squares(neighbours):
         right = a.T @ y / 4.0
         right[TERMS + 2] -= prior[TERMS + 2] * 0.1
         step = np.linalg.solve(a.T @ a / 4.0 + np.diag(prior), right)
-        np.testing.assert_allclose(
-            background[k], fit.background[k] + step[:TERMS], rtol=1e-3, atol=1e-3
-        )
+        # The unit of a step of the background is the direct light in the middle.
+        relative = step[:TERMS] / np.exp(fit.background[k, 0])
+        np.testing.assert_allclose(background[k], fit.background[k] + relative, atol=1e-5)
         moved = np.clip(step[TERMS : TERMS + 2], -0.5, 0.5)
         np.testing.assert_allclose(centres[k], fit.uv[k] + moved, atol=1e-3)
         assert depth[k] == pytest.approx(
@@ -401,7 +403,8 @@ def test_beads_are_grouped_by_their_neighbours_and_alone_first():
 def test_windows_begin_with_the_upper_quartile_and_need_most_of_their_pixels():
     fit = fit_of()
     for k in range(3):
-        assert np.mean(fit.grey[k] < fit.background[k, 0]) == pytest.approx(0.75, abs=0.02)
+        light = np.exp(fit.background[k, 0])
+        assert np.mean(fit.grey[k] < light) == pytest.approx(0.75, abs=0.02)
     valid = fit.valid.copy()
     valid[1] = np.arange(len(fit.offset)) < 0.59 * len(fit.offset)
     fit._set_windows(fit.grey, valid, fit.grey)
@@ -474,7 +477,7 @@ def test_a_profile_is_fitted_to_what_it_absorbs():
     rng = np.random.default_rng(10)
     distance = rng.uniform(0, 9, 4000)
     share = (1 - true.scatter) * true.shadow(distance)[0] + rng.normal(0, 0.01, 4000)
-    absorbed = Absorbed(distance, share, np.ones(4000), np.ones(4000))
+    absorbed = Absorbed(distance, share, *np.ones((3, 4000)))
     found = fit_profile(absorbed, Profile(4.5, 1.0, 0.9, 0.05))
     assert found.radius_px == pytest.approx(5.0, abs=0.15)
     assert found.blur_px == pytest.approx(1.2, abs=0.15)
@@ -660,10 +663,33 @@ def test_beads_of_several_sizes_tell_attenuation_from_scattered_light():
     share += rng.normal(0, 0.01, 12000)
     found = Profile(4.5, 1.0, 1.5, 0.1)
     for _ in range(4):  # each call makes a few steps only
-        found = fit_profile(Absorbed(distance, share, np.ones(12000), size), found)
+        absorbed = Absorbed(distance, share, np.ones(12000), size, np.ones(12000))
+        found = fit_profile(absorbed, found)
     assert found.radius_px == pytest.approx(5.0, abs=0.03)
     assert found.attenuation == pytest.approx(0.8, abs=0.05)
     assert found.scatter == pytest.approx(0.1, abs=0.015)
+
+
+def test_shadows_in_different_light_tell_attenuation_from_scattered_light():
+    """Where there is little direct light, a larger share of the light is scattered."""
+    true = Profile(5.0, 1.2, 0.8, 0.1)
+    rng = np.random.default_rng(13)
+    distance = rng.uniform(0, 9, 12000)
+    around = rng.choice([0.8, 1.0, 2.0, 4.0], 12000)
+    share = (1 - true.scatter * around) * true.shadow(distance)[0] + rng.normal(0, 0.01, 12000)
+    found = Profile(4.5, 1.0, 1.5, 0.3)
+    for _ in range(4):  # each call makes a few steps only
+        found = fit_profile(Absorbed(distance, share, *np.ones((2, 12000)), around), found)
+    assert found.attenuation == pytest.approx(0.8, abs=0.05)
+    assert found.scatter == pytest.approx(0.1, abs=0.005)
+
+
+def test_surrounding_light_is_a_wide_mean():
+    grey = np.full((512, 640), 100, np.float32)
+    grey[:, 320:] = 300
+    light = Light(grey, np.ones(grey.shape, bool))
+    around = light.around(np.array([[0.0, 0], [319.5, 250], [359.5, 250], [639, 511], [900, 900]]))
+    assert around == pytest.approx([100, 200, 200 + 200 * 0.3413, 300, 300], abs=10)
 
 
 def test_noise_that_is_blurred_is_correlated_in_two_directions_as_well():

@@ -437,13 +437,18 @@ def test_light_behind_two_beads_changes_with_the_scattered_light():
         light, shadows.uv, shadows.shape, profile, Noise(0.0, 1.0, np.ones((1, 1))), np.ones(36)
     )
     fit.run(4)
+    fit.background[:] = np.log(800.0), 0, 0, 0, 0, 0
+    fit.around[:] = 900.0
     fit._cross()
     rows, near = (np.concatenate(parts) for parts in zip(*fit.groups[1:]))
     before, jacobian = fit._model(rows, near)
     slope = _by_scatter(fit, rows, near, before, jacobian)
     change = 1e-3
     fit.profile = replace(profile, scatter=0.2 + change)
-    fit.depth *= 0.8 / (0.8 - change)
+    # The light without beads stays the same.
+    direct = np.exp(fit.background[:, 0])
+    fit.background[:, 0] = np.log(direct - change * fit.around)
+    fit.depth *= direct / (direct - change * fit.around)
     fit._cross()
     after, _ = fit._model(rows, near)
     # The tolerance allows for the blur of touching shadows on three grid points per pixel.

@@ -55,14 +55,14 @@ def test_strengths_are_those_of_the_backgrounds(true):
         weight
     )
     spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
-    assert np.median(spectra.strengths(1.0)) == pytest.approx(true, rel=0.5)
+    assert np.median(spectra.strengths(1.0).variance) == pytest.approx(true, rel=0.5)
 
 
 def test_noise_alone_has_no_background():
     relative, jacobian, weight = windows(200, 5)
     residual = np.random.default_rng(6).normal(size=relative.shape) / np.sqrt(weight)
     spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
-    assert np.count_nonzero(spectra.strengths(1.0)) <= 2
+    assert np.count_nonzero(spectra.strengths(1.0).variance) <= 2
 
 
 @pytest.mark.parametrize('scale', [0.5, 4.0])
@@ -74,7 +74,7 @@ def test_backgrounds_of_some_windows_are_found_whatever_the_noise(scale):
     amplitude *= np.sqrt(30.0 * scale * COSINES.variance)
     residual[:60] += relative[:60] * (amplitude @ COSINES.waves)
     spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
-    found = spectra.strengths(1.0)
+    found = spectra.strengths(1.0).variance
     # In units of the noise variance that the weights imply.
     assert np.log2(np.median(found[:60]) / 30.0) == pytest.approx(0, abs=1)
     assert np.count_nonzero(found[:60]) >= 54
@@ -90,5 +90,23 @@ def test_slow_waves_of_correlated_noise_are_no_background():
     summed = sum(white[:, i : i + side, j : j + side] for i in range(3) for j in range(3)) / 3
     residual = summed[:, rows, columns] / np.sqrt(weight)
     spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
-    assert np.count_nonzero(spectra.strengths(1.0)) > 150
-    assert np.count_nonzero(spectra.strengths(9.0)) <= 2
+    assert np.count_nonzero(spectra.strengths(1.0).variance) > 150
+    assert np.count_nonzero(spectra.strengths(9.0).variance) <= 2
+
+
+@pytest.mark.parametrize('direction', [0.0, 0.6])
+def test_a_straight_edge_has_more_evidence_than_a_background_without_direction(direction):
+    relative, jacobian, weight = windows(100, 11)
+    rng = np.random.default_rng(12)
+    across = OFFSET @ [np.cos(direction), np.sin(direction)]
+    edge = 8 * np.maximum(across - rng.uniform(-4, 4, 100)[:, None], 0)
+    residual = relative * edge + rng.normal(size=relative.shape) / np.sqrt(weight)
+
+    def evidence(cosines):
+        spectra = cosines.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
+        return spectra.strengths_at(1.0, 1.0).evidence
+
+    without = evidence(COSINES)
+    assert np.mean(evidence(Cosines(OFFSET, np.float64, direction)) > without) > 0.9
+    # In a wrong direction it has not.
+    assert np.mean(evidence(Cosines(OFFSET, np.float64, direction + 1.0)) > without) < 0.1

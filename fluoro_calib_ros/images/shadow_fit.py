@@ -15,14 +15,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import product
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from .light import MIN_PIXELS, Cosines, Noise, Spectra, correlation_of, less_common
+from .light import (
+    MIN_PIXELS,
+    Cosines,
+    Noise,
+    Spectra,
+    Strengths,
+    correlation_of,
+    less_common,
+)
 
 MAX_SIGMA_PX = 0.3  # largest standard deviation of the centre of a visible shadow
 MARGIN_PX = 2.0  # width of the background around the shadow
@@ -121,6 +128,12 @@ def window_offsets(radius_px: float) -> NDArray[np.int64]:
     return offsets
 
 
+@lru_cache(maxsize=2 * DIRECTIONS)
+def _cosines_in(squared_px: int, across: float | None) -> Cosines:
+    """Return the waves in a round window; squared_px: square of its radius."""
+    return Cosines(window_offsets(float(np.sqrt(squared_px + 0.5))), DTYPE, across)
+
+
 class FineGrid:
     """Grid finer than the pixels, on which light that passes through several beads is blurred.
 
@@ -194,7 +207,6 @@ class ShadowFit(ABC):
         self.plane_only = False  # whether the background is a polynomial of degree 1
         self.strength = np.zeros(n)  # strength of the background beyond the polynomial
         self.across = np.full(n, NO_EDGE)  # direction across a straight edge in that background
-        self._waves: dict[int, Cosines] = {}
         self.groups: list[Group] = []
 
     def _set_windows(
@@ -367,31 +379,50 @@ class ShadowFit(ABC):
         rest = residual / np.maximum(root, DTYPE(1e-12))
         ends = np.cumsum([len(jacobian) for jacobian in jacobians])[:-1]
         parts = list(zip(jacobians, np.split(root**2, ends), np.split(rest, ends)))
-
-        def spectra(chosen: NDArray[np.bool_], across: int) -> Spectra:
-            cosines = self._cosines(across)
-            out = []
-            for (jacobian, weight, left), some in zip(parts, np.split(chosen, ends)):
-                if not some.all():
-                    jacobian, weight, left = jacobian[some], weight[some], left[some]
-                out.append(
-                    cosines.spectra(
-                        jacobian[:, 0], jacobian=jacobian, weight=weight, residual=left
-                    )
-                )
-            return Spectra.joined(out)
-
+        spectra = [
+            self._cosines(NO_EDGE).spectra(one[:, 0], jacobian=one, weight=weight, residual=left)
+            for one, weight, left in parts
+        ]
         # The waves are longer than the correlation length of the noise.
         excess = float(self.correlation.sum())
-        strengths = spectra(np.ones(len(rows), dtype=bool), NO_EDGE).strengths(excess)
+        strengths = Spectra.joined(spectra).strengths(excess)
         self.strength[rows] = strengths.variance
-        across = self._steepest()[rows]
-        for direction in np.unique(across[strengths.variance > 0]).tolist():
-            chosen = (strengths.variance > 0) & (across == direction)
-            edge = spectra(chosen, direction).strengths_at(excess, strengths.scale)
-            better = edge.evidence > strengths.evidence[chosen]
-            self.strength[rows[chosen][better]] = edge.variance[better]
-            self.across[rows[chosen][better]] = direction
+        if strengths.variance.any():
+            self._add_edges(rows, parts, strengths, excess)
+
+    def _add_edges(
+        self,
+        rows: NDArray[np.int64],
+        parts: Sequence[tuple[np.ndarray, ...]],
+        strengths: Strengths,
+        excess: float,
+    ) -> None:
+        """Note straight edges where they explain a background better than waves without direction.
+
+        parts: derivatives (k, u, m), weights and residuals (k, m) of the windows in rows, in turn.
+        """
+        ends = np.cumsum([len(weight) for _, weight, _ in parts])[:-1]
+        some = [np.flatnonzero(variance) for variance in np.split(strengths.variance, ends)]
+        jacobian = _padded([one[chosen] for (one, _, _), chosen in zip(parts, some)])
+        weight = np.concatenate([one[chosen] for (_, one, _), chosen in zip(parts, some)])
+        residual = np.concatenate([one[chosen] for (_, _, one), chosen in zip(parts, some)])
+        textured = np.flatnonzero(strengths.variance)
+        across = self._steepest()[rows[textured]]
+        order = np.argsort(across, kind='stable')
+        spectra = []
+        for direction in np.unique(across).tolist():
+            own = order[across[order] == direction]
+            cosines = self._cosines(direction)
+            spectra.append(
+                cosines.spectra(
+                    jacobian[own, 0], jacobian[own], weight=weight[own], residual=residual[own]
+                )
+            )
+        edges = Spectra.joined(spectra).strengths_at(excess, strengths.scale)
+        better = edges.evidence > strengths.evidence[textured[order]]
+        windows = rows[textured[order]][better]
+        self.strength[windows] = edges.variance[better]
+        self.across[windows] = across[order][better]
 
     def _steepest(self) -> NDArray[np.int64]:
         """Return directions (n,) in which the light changes most, in steps of a half turn.
@@ -415,10 +446,8 @@ class ShadowFit(ABC):
 
     def _cosines(self, across: int) -> Cosines:
         """Return the waves of the background beyond the polynomial."""
-        if across not in self._waves:
-            angle = None if across == NO_EDGE else across * np.pi / DIRECTIONS
-            self._waves[across] = Cosines(self.offset, DTYPE, angle)
-        return self._waves[across]
+        angle = None if across == NO_EDGE else across * np.pi / DIRECTIONS
+        return _cosines_in(int((self.offset**2).sum(axis=1).max()), angle)
 
     def _standardised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Return standardised residuals of all windows.
@@ -544,6 +573,18 @@ class ShadowFit(ABC):
         return np.column_stack(gradient) * (self.profile.variance_px2 / self.window_px)
 
 
+def _padded(parts: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Return derivatives (n, u, m) of all parts (k, u, m), zero for unknowns of larger parts."""
+    count = sum(len(part) for part in parts)
+    unknowns = max(part.shape[1] for part in parts)
+    out = np.zeros((count, unknowns, parts[0].shape[2]), dtype=DTYPE)
+    begin = 0
+    for part in parts:
+        out[begin : begin + len(part), : part.shape[1]] = part
+        begin += len(part)
+    return out
+
+
 def _within(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
     """Return values between bounds: like np.clip, in a third of its time for a few values."""
     return np.minimum(np.maximum(values, low), high)
@@ -582,7 +623,7 @@ MAX_ABSORBED = float(-np.expm1(-2 * HIGH[2]))  # share of the direct light
 CHANGE = 1.5  # largest factor on the first three in one fit
 RING_PX = 0.25  # width of the rings to whose means a profile is fitted
 AROUND_STEP = 1.5  # ratio of shares of the surrounding light in rings that are kept apart
-CLASSES = 4  # largest number of such steps
+AROUND_STEPS = 4  # largest number of such steps
 
 
 @dataclass(frozen=True)
@@ -773,21 +814,24 @@ class Absorbed:
     around: NDArray[np.floating]  #: (n,), light of the surroundings over that without beads
 
     def binned(self, profile: Profile) -> Iterator[_Binned]:
-        """Yield means over rings, up to the reach of the profile.
+        """Yield means over rings for the beads of each size, up to the reach of the profile.
 
-        Beads are separated by size, and their pixels by the share of the surrounding light.
+        Pixels of a ring are separated by the light of their surroundings.
         """
-        share = np.clip(np.rint(np.log(self.around) / np.log(AROUND_STEP)), -CLASSES, CLASSES)
-        for size, class_ in product(np.unique(self.size), np.unique(share)):
-            own = (self.size == size) & (share == class_)
+        step = np.rint(np.log(self.around) / np.log(AROUND_STEP)).astype(int)
+        step = np.clip(step, -AROUND_STEPS, AROUND_STEPS) + AROUND_STEPS
+        for size in np.unique(self.size):
+            own = self.size == size
             edges = np.arange(0, profile.sized(float(size)).reach_px + 1, RING_PX)
-            cell = np.digitize(self.distance[own], edges)
+            shape = len(edges) + 1, 2 * AROUND_STEPS + 1
+            cell = np.digitize(self.distance[own], edges) * shape[1] + step[own]
             values = (np.ones(1), self.share[own], self.distance[own], self.around[own])
             sums = [
-                np.bincount(cell, weights=self.weight[own] * one, minlength=len(edges) + 1)[1:-1]
+                np.bincount(cell, weights=self.weight[own] * one, minlength=shape[0] * shape[1])
                 for one in values
             ]
-            total, *means = np.array(sums)[:, sums[0] > 0]
+            rings = np.reshape(sums, (len(values), *shape))[:, 1:-1]
+            total, *means = rings[:, rings[0] > 0]
             yield _Binned(float(size), np.sqrt(total), *(mean / total for mean in means))
 
 

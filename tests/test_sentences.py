@@ -604,7 +604,7 @@ SENTENCES = {
         'right value, a larger --interior-sd, or none'
     ),
     Kind.VALIDATION: (
-        'the validation could not be made: fluoroscope a: # exposures are too few, # are '
+        'the validation could not be performed: fluoroscope a: # exposures are too few, # are '
         'needed, # more have too few targets'
     ),
     Kind.COPIED_EXPOSURE: ('fluoroscope a, exposure #: the image points are those of exposure #'),
@@ -679,9 +679,8 @@ SENTENCES = {
         'the target ids are wrong'
     ),
     Kind.REMOTE_TARGETS: (
-        'phantom: target # is # mm from the middle of the others, most of which are within # '
-        'mm: a wrong coordinate, another unit, or a fill value for targets that are not '
-        'surveyed'
+        'phantom: target # is # mm from the centre of the others, most of which are within # mm: '
+        'a wrong coordinate, another unit, or a fill value for targets that are not surveyed'
     ),
     Kind.REPEATED_COORDINATES: (
         'phantom: targets #, # are all at (#, #, #) mm: a repeated row, or a fill value for '
@@ -721,7 +720,7 @@ SENTENCES = {
         'exposures'
     ),
     Kind.PRINCIPAL_POINT_OFF: (
-        'the principal point (#, #) is # px from the middle of the image: wrong target ids, a '
+        'the principal point (#, #) is # px from the centre of the image: wrong target ids, a '
         'wrong image size, or another phantom'
     ),
     Kind.WRONG_PRINCIPAL_DISTANCE: (
@@ -729,7 +728,7 @@ SENTENCES = {
         'be given in pixels'
     ),
     Kind.CORRECTED_ALREADY: (
-        'fluoroscope a: the image points are corrected already, their RMSE is # px with the '
+        'fluoroscope a: the image points are already corrected, their RMSE is # px with the '
         'correction and # px without: give the observed ones'
     ),
     Kind.POOR_CALIBRATION_FIT: (

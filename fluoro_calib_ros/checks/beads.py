@@ -422,8 +422,8 @@ def _not_made(kind: Kind, count: int) -> Check:
     """Return a check that could not be made because too few beads are seen."""
     return Check(
         kind,
-        f'check {kind.value} could not be made, only {count} beads are seen often enough to be '
-        'found from the images alone',
+        f'check {kind.value} could not be performed, only {count} beads are seen often enough to '
+        'be found from the images alone',
         advice='take more exposures',
         numbers={'beads': count},
     )
@@ -441,7 +441,7 @@ def _check_distances(beads: Beads, has_trend: bool) -> Check:
     if len(beads.target_id) < MIN_BEADS:
         return Check(
             Kind.DISTANCES,
-            'check distances could not be made, too few beads agree with their survey',
+            'check distances could not be performed, too few beads agree with their survey',
         )
     measured = distances(beads)
     by_chance = float(np.sqrt(chdtri(measured.freedom, FALSE_ALARM) / measured.freedom))

@@ -102,8 +102,8 @@ def corrected_already(
     )
     return Finding(
         Kind.CORRECTED_ALREADY,
-        f'the image points are corrected already, their RMSE is {rmse:.2f} px with the correction '
-        f'and {rmse_without:.2f} px without',
+        f'the image points are already corrected, their RMSE is {rmse:.2f} px with the '
+        f'correction and {rmse_without:.2f} px without',
         Place(tuple(names)),
         'give the observed ones',
         numbers={'rmse_px': rmse, 'rmse_without_px': rmse_without},

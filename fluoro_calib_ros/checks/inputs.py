@@ -190,8 +190,8 @@ def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
         out.append(
             Finding(
                 Kind.REMOTE_TARGETS,
-                f'target {first_few(seen_id[remote])} is {distance[remote].max():.0f} mm from the '
-                f'middle of the others, most of which are within {extent:.0f} mm',
+                f'target {first_few(seen_id[remote])} is {distance[remote].max():.0f} mm from '
+                f'the centre of the others, most of which are within {extent:.0f} mm',
                 replace(_PHANTOM, target_id=tuple(seen_id[remote].tolist())),
                 'a wrong coordinate, another unit, or a fill value for targets that are not '
                 'surveyed',
@@ -588,7 +588,7 @@ def _wrong_interior(
         return None
     return Finding(
         Kind.PRINCIPAL_POINT_OFF,
-        f'the principal point ({xp:.0f}, {yp:.0f}) is {offset:.0f} px from the middle of the '
+        f'the principal point ({xp:.0f}, {yp:.0f}) is {offset:.0f} px from the centre of the '
         'image',
         advice='wrong target ids, a wrong image size, or another phantom',
         numbers={'offset_px': offset},

@@ -134,7 +134,7 @@ def halves_not_compared(reason: str) -> Check:
     """Return the check 'halves' that could not be made, with a reason."""
     return Check(
         Kind.HALVES,
-        f'check halves could not be made, {reason}',
+        f'check halves could not be performed, {reason}',
         advice='take more exposures',
     )
 

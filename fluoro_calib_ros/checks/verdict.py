@@ -244,7 +244,7 @@ def validate_or_report(
     try:
         return validate(request, calibrations, progress, rig)
     except DataError as error:
-        check = Check(Kind.VALIDATION, f'the validation could not be made: {error}')
+        check = Check(Kind.VALIDATION, f'the validation could not be performed: {error}')
         return Validation('cannot tell', (check,), ids_of(calibrations), 0.0)
 
 

@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> None:
         print_note(f'{arguments.source}: {outcome.noise.sentence}')
     if outcome.widening > 1:
         advice = (
-            'check the sigma of the image points, whether they are corrected already or count '
+            'check the sigma of the image points, whether they are already corrected or count '
             'from 1, and whether a fluoroscope has moved since its calibration'
         )
         print_note(

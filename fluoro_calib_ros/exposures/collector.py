@@ -193,7 +193,8 @@ class ExposureCollector:
         for name in wanted:
             if name not in self.fluoroscopes:
                 raise DataError(
-                    f'fluoroscope {name} is unknown, there are {", ".join(self.fluoroscopes)}'
+                    f'fluoroscope {name} is unknown, expected one of '
+                    f'{", ".join(self.fluoroscopes)}'
                 )
         return {
             name: [pair[name] for pair in self.exposures]

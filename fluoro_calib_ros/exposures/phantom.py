@@ -115,7 +115,7 @@ def require_size(phantom: Phantom) -> None:
         return
     units = [unit for unit, mm in UNITS_MM.items() if low <= extent * mm <= high]
     if not units:
-        cause = 'this is no phantom'
+        cause = 'this is not a phantom'
     else:
         cause = f'the coordinates are in {units[0]}, not in mm, or in another unit'
     raise DataError(

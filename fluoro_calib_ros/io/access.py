@@ -93,8 +93,7 @@ def read_bytes(path: PathLike) -> bytes:
         limits = read_limits()
         if size > limits.max_file_bytes:
             raise DataError(
-                f'the file has {size / 1e6:.0f} MB, more than {limits.max_file_mb} MB '
-                'are not read',
+                f'the file has {size / 1e6:.0f} MB; the limit is {limits.max_file_mb} MB',
                 at=path,
             )
         content = file.read()
@@ -138,7 +137,7 @@ def check_rows(text: str, most: int, where: object) -> None:
     """Raise DataError for a text of more than `most` rows; the message begins with where."""
     rows = text.count('\n')
     if rows > most:
-        raise DataError(f'{where}: {rows} rows, more than {most} are not read')
+        raise DataError(f'{where}: {rows} rows; the limit is {most}')
 
 
 def check_safe_name(name: str, where: object) -> None:

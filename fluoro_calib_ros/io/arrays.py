@@ -132,8 +132,7 @@ def _read_members(
     limits = read_limits()
     if size > limits.max_file_bytes:
         raise DataError(
-            f'{path}: its arrays take {size / 1e6:.0f} MB, more than {limits.max_file_mb} MB are '
-            'not read'
+            f'{path}: its arrays take {size / 1e6:.0f} MB; the limit is {limits.max_file_mb} MB'
         )
     version = _read_version(path, archive, layout)
     for field in layout.fields:

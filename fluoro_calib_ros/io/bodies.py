@@ -70,7 +70,8 @@ def read_bodies(path: PathLike) -> tuple[Body, ...]:
         unknown = [name for name in block.header if name not in BODY_COLUMNS]
         if unknown:
             raise DataError(
-                f'{path}: the column {unknown[0]!r} is unknown, there are {",".join(BODY_COLUMNS)}'
+                f'{path}: the column {unknown[0]!r} is unknown, expected one of '
+                f'{",".join(BODY_COLUMNS)}'
             )
         names = block.strings('body')
         markers = block.ids('marker').tolist()
@@ -180,7 +181,7 @@ def read_joints(path: PathLike, bodies: Iterable[Body | str]) -> tuple[JointEntr
     if not isinstance(tables, list) or not tables:
         raise DataError(f'{path}: the file has no table [[joint]]')
     if len(tables) > MAX_JOINTS:
-        raise DataError(f'{path}: {len(tables)} joints, more than {MAX_JOINTS} are not read')
+        raise DataError(f'{path}: {len(tables)} joints; the limit is {MAX_JOINTS}')
     entries = tuple(_entry(path, n, table) for n, table in enumerate(tables, 1))
     with ErrorsAt(path):
         names = [body if isinstance(body, str) else body.name for body in bodies]
@@ -197,7 +198,7 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
         where = f'{path}, joint {table["name"]}'
     for key in table:
         if key not in KEYS:
-            raise DataError(f'{where}, key {key}: unknown, there are {", ".join(KEYS)}')
+            raise DataError(f'{where}, key {key}: unknown, expected one of {", ".join(KEYS)}')
     texts: dict[str, str] = {}
     for key in (*REQUIRED, 'side'):
         value = table.get(key, '' if key == 'side' else None)
@@ -243,7 +244,9 @@ def _frame(of: Convention, end: str, table: Any, side: str) -> AnatomicalFrame:
             raise DataError('this is not a table')
         for key in table:
             if key not in FRAME_KEYS:
-                raise DataError(f'the key {key} is unknown, there are {", ".join(FRAME_KEYS)}')
+                raise DataError(
+                    f'the key {key} is unknown, expected one of {", ".join(FRAME_KEYS)}'
+                )
         given_keys = [key for key in FRAME_KEYS[:4] if key in table]
         if len(given_keys) != 1:
             raise DataError(f'one of {", ".join(FRAME_KEYS[:4])} is needed, not {len(given_keys)}')

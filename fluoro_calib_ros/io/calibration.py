@@ -139,8 +139,8 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
     limits = read_limits()
     if lengths['train_uv'] > limits.max_training_points:
         raise DataError(
-            f'{where}: {lengths["train_uv"]} training points, more than '
-            f'{limits.max_training_points} are not read'
+            f'{where}: {lengths["train_uv"]} training points; the limit is '
+            f'{limits.max_training_points}'
         )
     # Points that coincide in single precision: a search tree cannot separate them.
     counts = np.unique(arrays['train_uv'].astype(np.float32), axis=0, return_counts=True)[1]
@@ -221,8 +221,8 @@ def load_orientation(path: PathLike) -> RigOrientation:
     max_fluoroscopes = read_limits().max_fluoroscopes
     if len(values['fluoroscope']) > max_fluoroscopes:
         raise DataError(
-            f'{path}: the orientation has {len(values["fluoroscope"])} fluoroscopes, more than '
-            f'{max_fluoroscopes} are not read'
+            f'{path}: the orientation has {len(values["fluoroscope"])} fluoroscopes; the limit '
+            f'is {max_fluoroscopes}'
         )
     for name in values['fluoroscope'].tolist():
         check_safe_name(name, path)

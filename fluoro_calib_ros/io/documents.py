@@ -133,8 +133,8 @@ def _check_size(kind: str, text: str, where: object) -> None:
     limit = DOCUMENT_BYTES[kind]
     if len(text) > limit:
         raise DataError(
-            f'{where}: the {kind} text has {len(text) / 1e6:.1f} MB, more than {limit / 1e6:g} MB '
-            'are not read'
+            f'{where}: the {kind} text has {len(text) / 1e6:.1f} MB; the limit is '
+            f'{limit / 1e6:g} MB'
         )
 
 

@@ -81,7 +81,8 @@ def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathL
             )
         if target.startswith(os.path.join(source, '')):
             raise DataError(
-                f'{path}: the output lies in the input {input_path}, choose another output folder'
+                f'{path}: the output is inside the input {input_path}, choose another output '
+                'folder'
             )
     for folder in (target, target + PREVIOUS):
         _check_kind(folder, kind)

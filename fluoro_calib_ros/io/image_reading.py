@@ -152,7 +152,7 @@ def count_pages(path: PathLike) -> int:
         count = 0
         complete = False
     if not count or not complete:
-        raise DataError('this is no TIFF file, or it is cut off or damaged', at=path)
+        raise DataError('this is not a TIFF file, or it is cut off or damaged', at=path)
     with ErrorsAt(path):
         check_size(*size)
     return count
@@ -270,7 +270,7 @@ def _open_video(path: Path) -> ImageSource:
     check_name(path)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
-        raise DataError('this is no video that can be read, or it is damaged', at=path)
+        raise DataError('this is not a video that can be read, or it is damaged', at=path)
     with ErrorsAt(path):
         check_size(*(int(video.get(key)) for key in VIDEO_SIZE))
     frame_rate = video.get(cv2.CAP_PROP_FPS)

@@ -179,7 +179,7 @@ def _check_keys(path: Path, document: Mapping[str, Any], keys: Sequence[str]) ->
     """Raise DataError for an unknown key."""
     for key in document:
         if key not in keys:
-            raise DataError(f'{path}, key {key}: unknown, there are {", ".join(keys)}')
+            raise DataError(f'{path}, key {key}: unknown, expected one of {", ".join(keys)}')
 
 
 # study.toml: a calibration and the trials that use it, for `fluoro-calib process`.
@@ -302,7 +302,7 @@ def _matching(path: Path, pattern: str, out: Path) -> Sequence[Trial]:
     try:
         paths = sorted(folder.glob(pattern))
     except (ValueError, OSError) as error:
-        raise DataError(f'{path}, key trials: {pattern!r} is no pattern ({error})') from None
+        raise DataError(f'{path}, key trials: {pattern!r} is not a pattern ({error})') from None
     trials = []
     for trial_path in paths:
         relative = trial_path.relative_to(folder)

@@ -181,7 +181,7 @@ def run_extraction(
     """
     sources = open_sources(request.sources, request.fluoroscope, request.angles)
     if request.regular_grid and FlatGrid.of(request.phantom.xyz_mm) is None:
-        raise DataError('the phantom is no flat grid with rows and columns')
+        raise DataError('the phantom is not a flat grid with rows and columns')
     if request.overlay is not None:
         make_folder(request.overlay)
     with open_workers(request.workers, request.scheduler, sources.count) as workers:

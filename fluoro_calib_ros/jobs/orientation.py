@@ -88,8 +88,8 @@ def orient(
     met = _met(reconstructed, phantom)
     if not met.is_good and _fits_uncorrected(frames, phantom, calibrations, frame_id):
         raise DataError(
-            'the image points are corrected already, their rays meet without the correction '
-            'of the calibrations only',
+            'the image points are already corrected, their rays meet without the correction of '
+            'the calibrations only',
             kind=Kind.CORRECTED_ALREADY,
             advice='give the observed ones',
         )

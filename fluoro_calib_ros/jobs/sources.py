@@ -337,7 +337,7 @@ def require_observed(path: object, corrected_by: Mapping[str, str]) -> None:
     """Raise DataError for image points that are already corrected by a calibration."""
     for name, identity in corrected_by.items():
         raise DataError(
-            f'{path}: the image points of fluoroscope {name} are corrected already, by the '
+            f'{path}: the image points of fluoroscope {name} are already corrected, by the '
             f'calibration {identity}: give the observed ones, or remove the column '
             f'{CORRECTED_BY} where this is not so'
         )

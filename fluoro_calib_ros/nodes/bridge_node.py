@@ -75,7 +75,7 @@ class Admission:
         fields = (line.partition(':') for line in lines)
         headers = {name.strip().lower(): value.strip() for name, _, value in fields}
         if len(words) != 3 or words[0] != 'GET':
-            return 'this is no request of a WebSocket'
+            return 'this is not a WebSocket request'
         with suppress(ValueError):
             token = parse_qs(urlsplit(words[1]).query).get('token', [''])[0]
             if hmac.compare_digest(token.encode(), self.token.encode()):

@@ -185,7 +185,7 @@ def _essential_jacobian(
 
 MIN_POINTS = 20  # minimum number of points in two views for judging a recording
 MAX_REJECTED = 0.5  # maximum share of rejected points in two views
-CORRECTED = Finding(Kind.CORRECTED_ALREADY, 'the image points are corrected already')
+CORRECTED = Finding(Kind.CORRECTED_ALREADY, 'the image points are already corrected')
 MAX_TRIED = 10  # maximum number of exposures to try
 UNKNOWN = Finding(
     Kind.RAYS_DO_NOT_MEET,

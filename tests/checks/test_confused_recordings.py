@@ -565,7 +565,7 @@ def test_a_file_of_corrected_points_says_so(tmp_path, capsys):
     ):
         capsys.readouterr()
         assert run(*command) == 1
-        assert 'are corrected already' in capsys.readouterr().err
+        assert 'are already corrected' in capsys.readouterr().err
     # Uncorrected output can still be converted.
     assert run('convert', corrected, *with_held, '--to', 'xmalab2d', *out) == 0
 

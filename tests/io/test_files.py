@@ -377,7 +377,7 @@ def test_observations_require_the_image_size(tmp_path):
         ('a,0,3,nan,2,', "row 4: u is 'nan', not a finite number"),
         ('a,0,3,1,-inf,', "row 4: v is '-inf', not a finite number"),
         ('a,x,3,1,2,', "row 4: exposure is 'x', not a whole number"),
-        ('a,0,3,1024,2,', 'row 4: the point (1024, 2) is off the image of 1024 x 960 px'),
+        ('a,0,3,1024,2,', 'row 4: the point (1024, 2) is outside the image of 1024 x 960 px'),
         ('a,0,1,1,2,', 'row 4: target 1 of fluoroscope a, exposure 0 is already given in row 2'),
         ('a,0,3,1,2,0.5', 'sigma of target 1 of fluoroscope a, exposure 0 is empty'),
         ('a,1,3,1,2,0', "row 4: sigma is '0', not a finite number above 0"),

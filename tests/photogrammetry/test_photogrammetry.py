@@ -484,7 +484,7 @@ def some_phantom():
         ),
         (
             {'uv': np.array([[1, 1], [2, 2], [3, 3], [639.6, 4]])},
-            'target 4 is off the image of 640 x 480 px',
+            'target 4 is outside the image of 640 x 480 px',
         ),
         ({'target_id': np.array([5, 3, 5, 4])}, 'target 5 occurs 2 times'),
         ({'target_id': np.array([5, 3, 8, 4])}, 'target 8 is not on the phantom'),

@@ -86,8 +86,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         with ErrorsAt(where):
             if len(message.data) > MAX_OBSERVATIONS:
                 raise DataError(
-                    f'the message has {len(message.data)} bytes, more than {MAX_OBSERVATIONS} '
-                    'are not read'
+                    f'the message has {len(message.data)} bytes; the limit is {MAX_OBSERVATIONS}'
                 )
             frame = frame_from_message(from_cdr(message.data, TARGET_OBSERVATIONS), name)
             if validate:

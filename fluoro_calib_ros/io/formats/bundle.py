@@ -156,7 +156,7 @@ def _frame(rows: Sequence[Row], name: str, exposure: int, size: tuple[int, int])
     on_image = points_on_image(uv, size)
     if not on_image.all():
         rows[int(np.argmin(on_image))].fail(
-            f'the point is off the image of {size[0]} x {size[1]} px; y is negative downwards'
+            f'the point is outside the image of {size[0]} x {size[1]} px; y is negative downwards'
         )
     if not (values[:, 2:4] > 0).all():
         rows[int(np.argmin((values[:, 2:4] > 0).all(axis=1)))].fail('the noise is not above 0')

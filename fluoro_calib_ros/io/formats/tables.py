@@ -59,7 +59,7 @@ def frame_of(
     if not on_image.all():
         u, v = uv[np.argmin(on_image)]
         raise DataError(
-            f'{where}: the point ({u:g}, {v:g}) is off the image of {image_size[0]} x '
+            f'{where}: the point ({u:g}, {v:g}) is outside the image of {image_size[0]} x '
             f'{image_size[1]} px'
         )
     return Frame(fluoroscope, number, target_id, uv, image_size, frame_id=f'{fluoroscope}_optical')

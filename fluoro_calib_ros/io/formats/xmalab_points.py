@@ -146,8 +146,8 @@ def _check_point(
         index = int(np.argmax(is_off_image))
         target, camera = header[2 * index]
         row.fail(
-            f'the point ({uv[index, 0]:g}, {uv[index, 1]:g}) of {target} in cam{camera} is off '
-            f'the image of {size[0]} x {size[1]} px'
+            f'the point ({uv[index, 0]:g}, {uv[index, 1]:g}) of {target} in cam{camera} is '
+            f'outside the image of {size[0]} x {size[1]} px'
         )
 
 

@@ -843,8 +843,8 @@ SENTENCES = {
     Kind.NO_DRIFT: 'no drift is seen',
     Kind.FEW_MARKERS: 'only # of # markers are where they are said to be at first',
     Kind.BODY_MIRRORED: (
-        'body femur: its coordinates are those of the mirrored body: they fit the points in '
-        'space to # mm, mirrored to # mm'
+        'body femur: its coordinates are mirrored: the points in space deviate from them by # '
+        'mm, and from their mirror image by # mm'
     ),
     Kind.BODY_NOT_RIGID: (
         'body femur: it is not rigid: its markers deviate from its shape by # mm (RMS; at most '
@@ -852,13 +852,13 @@ SENTENCES = {
     ),
     Kind.BODY_ON_A_LINE: (
         'body femur: its markers lie nearly on a line (condition number # per m, at most # by '
-        'ISO #): the rotation about it is weak'
+        'ISO #): the rotation about this line is poorly determined'
     ),
     Kind.BODY_UNSEEN: (
-        'body femur: no exposure shows three of its markers in space, its shape is not estimated'
+        'body femur: no exposure has three of its markers in space: its shape is not estimated'
     ),
     Kind.MARKER_LOOSE: (
-        'body femur: marker # moves against the others: its places scatter # times as much as '
+        'body femur: marker # moves relative to the others: its positions scatter by # times '
         'their standard deviations'
     ),
     Kind.MARKER_MIGRATED: (

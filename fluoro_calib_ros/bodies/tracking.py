@@ -361,8 +361,8 @@ class JointTracker:
     def __init__(self, joint: Joint, neutral: tuple[int, int] | None = None) -> None:
         if neutral is not None and neutral[1] - neutral[0] >= MAX_NEUTRAL:
             raise DataError(
-                f'joint {joint.name}: a neutral trial from exposure {neutral[0]} to {neutral[1]}; '
-                f'live it has at most {MAX_NEUTRAL} exposures'
+                f'joint {joint.name}: the neutral trial lasts from exposure {neutral[0]} to '
+                f'{neutral[1]}, but may have at most {MAX_NEUTRAL} exposures in live operation'
             )
         self.joint = joint
         self._neutral = neutral
@@ -394,7 +394,9 @@ class JointTracker:
             return
         collected, self._collected = self._collected, []
         if not collected:
-            self.error = DataError(f'joint {self.joint.name}: the neutral trial was not seen')
+            self.error = DataError(
+                f'joint {self.joint.name}: no exposure of the neutral trial was received'
+            )
             return
         try:
             trials = (_joined(poses) for poses in zip(*collected))

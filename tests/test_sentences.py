@@ -539,13 +539,13 @@ MAKERS = {
 SENTENCES = {
     Kind.DATA: 'phantom.csv: the file is empty',
     Kind.BEADS: (
-        'bead # lies # mm from its survey, the worst of #: survey again, or give a larger sd, '
-        'and calibrate again'
+        'bead # lies # mm from its survey, the largest deviation of #: survey again, or give a '
+        'larger sd, and calibrate again'
     ),
     Kind.DISTANCES: (
-        'distances between beads differ from the survey by # mm, # mm are expected (scale #, '
-        'sd #): the survey is less precise than its sd says, or the calibration is wrong if '
-        'other checks fail too; survey the phantom again, or give a larger sd'
+        'distances between beads differ from the survey by # mm, where # mm is expected (scale '
+        '#, sd #): the survey is less precise than its sd states, or, if other checks fail too, '
+        'the calibration is wrong; survey the phantom again, or give a larger sd'
     ),
     Kind.DRIFT: (
         'fluoroscope a: earlier and later exposures differ by # px, most at the @ of the image '
@@ -553,18 +553,17 @@ SENTENCES = {
         'of them again in one session, with nothing switched, moved or warming up'
     ),
     Kind.EXPOSURES: (
-        'fluoroscope a: exposure # fits the calibration of the others worst, with # times the '
-        'expected residuals: inspect it (phantom or fluoroscope moved, wrong ids), leave it '
-        'out by a decision in doubtful.csv and calibrate again'
+        'fluoroscope a: exposure # deviates most from the calibration of the others, its '
+        'residuals are # times the expected ones: inspect it (phantom or fluoroscope moved, '
+        'wrong ids), exclude it by a decision in doubtful.csv and calibrate again'
     ),
     Kind.HALVES: (
-        'fluoroscope a: two halves of the exposures give corrections that differ by # px, '
-        'where # px is predicted, most at the @ of the image (about u #, v #): take # more '
-        'exposures (there are #) that show beads there, and see that phantom and fluoroscope '
-        'stand still in each'
+        'fluoroscope a: two halves of the exposures give corrections that differ by # px, where '
+        '# px is predicted, most at the @ of the image (about u #, v #): take # more exposures '
+        '(there are #) that show beads there, and keep phantom and fluoroscope still during each'
     ),
     Kind.HELD_OUT: (
-        'fluoroscope a: residuals of exposures held out are # px, # px are expected: the '
+        'fluoroscope a: residuals of held-out exposures are # px, where # px is expected: the '
         'calibration does not hold for exposures it has not used; take # more exposures (there '
         'are #) in other poses'
     ),
@@ -574,17 +573,16 @@ SENTENCES = {
         '(--model auto), or take # more exposures (there are #), or a phantom with more beads'
     ),
     Kind.SHAPE: (
-        'the survey of the phantom is strained against the images by # % along (#, #, #), which '
-        'displaces beads by # mm (RMS): survey the phantom again, or give a larger sd, and '
+        'the survey of the phantom is strained relative to the images by # % along (#, #, #), '
+        'which displaces beads by # mm (RMS): survey the phantom again, or give a larger sd, and '
         'calibrate again'
     ),
     Kind.VARIATION: (
         'fluoroscope a: the distortion differs between exposures by # px (chi2/dof #, constant '
-        'up to #): a C-arm at another angle, a lens that was focused or zoomed, a source or '
-        'detector that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
-        'take # more exposures (there are #) at the angle and setting that are used, or '
-        'calibrate each; or give the angle of the C-arm with each exposure (angle_deg, or '
-        'joint_states)'
+        'up to #): a C-arm at another angle, a refocused or zoomed lens, an unstable source or '
+        'detector, or a phantom that moved, was bent or has a wrong survey; take # more '
+        'exposures (there are #) at the angle and setting in use, or calibrate each; or give the '
+        'angle of the C-arm with each exposure (angle_deg, or joint_states)'
     ),
     Kind.WHITENESS: (
         'fluoroscope a: the residuals have a trend of # px, most at the @ of the image (about '
@@ -593,15 +591,15 @@ SENTENCES = {
         '(--model auto)'
     ),
     Kind.WORST_AREA: (
-        'fluoroscope a: the worst mean residual of an area, # px, is at the @ of the image '
-        '(about u #, v #): take # more exposures (there are #) that show beads there, or '
-        'choose another model'
+        'fluoroscope a: the largest mean residual of an area, # px, is at the @ of the image '
+        '(about u #, v #): take # more exposures (there are #) that show beads there, or choose '
+        'another model'
     ),
     Kind.GIVEN_INTERIOR: (
-        'fluoroscope a: the given interior orientation, c = # (sd #), xp = # (sd #), yp = # '
-        '(sd #) px, contradicts the exposures, which show c = # (sd #), xp = # (sd #), yp = # '
-        '(sd #) px: the residuals are # px with what was given and # px without: give the '
-        'right value, a larger --interior-sd, or none'
+        'fluoroscope a: the given interior orientation, c = # (sd #), xp = # (sd #), yp = # (sd '
+        '#) px, contradicts the exposures, which show c = # (sd #), xp = # (sd #), yp = # (sd #) '
+        'px: the residuals are # px with the given values and # px without: give the correct '
+        'value, a larger --interior-sd, or none'
     ),
     Kind.VALIDATION: (
         'the validation could not be performed: fluoroscope a: # exposures are too few, # are '
@@ -649,29 +647,29 @@ SENTENCES = {
         'cannot be found: tilt the target by # degrees and more, or give the principal distance'
     ),
     Kind.DUPLICATE_NAME: (
-        'fluoroscopes a and A differ in capital letters only: this is one fluoroscope, or name '
-        'them otherwise'
+        'fluoroscopes a and A differ only in case: use one name for one fluoroscope, or rename '
+        'one of two'
     ),
     Kind.FRAMES_SHIFTED: (
         '# % of the rays miss each other: the frame numbers of fluoroscope b are too small by #'
     ),
     Kind.IDS_REVERSED: (
-        'the target ids run in the opposite order: with the right ones the image points fit '
-        'the phantom'
+        'the target ids run in the opposite order: with the correct ids the image points fit the '
+        'phantom'
     ),
     Kind.IDS_SHIFTED: (
-        'the target ids are too large by #: with the right ones the image points fit the phantom'
+        'the target ids are too large by #: with the correct ids the image points fit the phantom'
     ),
     Kind.IMAGE_MIRRORED: (
-        'the image is mirrored: v must run down and u to the right, and neither they nor the '
-        'axes of the phantom may be interchanged'
+        'the image is mirrored: u must run to the right and v down, and neither u and v nor axes '
+        'of the phantom may be interchanged'
     ),
     Kind.IMAGE_TRANSPOSED: '# % of the rays miss each other: u and v are interchanged',
     Kind.IMPLAUSIBLE_NUMBER: (
         'fluoroscope a, exposure #: sigma of target # is # px, between # and # px are plausible'
     ),
     Kind.MIXED_UNITS: (
-        'phantom: # targets, #, #, #, #, # and # more, are in another unit than the others: '
+        'phantom: # targets, #, #, #, #, # and # more, are in a different unit from the others: '
         'they fit when their coordinates are multiplied by # (cm in place of mm)'
     ),
     Kind.OTHER_PHANTOM: (
@@ -687,18 +685,17 @@ SENTENCES = {
         'targets that are not surveyed'
     ),
     Kind.SOURCE_TOO_NEAR: (
-        'the source would be # mm from a phantom that is # mm large, nearer than that of a '
-        'fluoroscope: the principal distance is wrong, or the images are those of a wide-angle '
-        'camera'
+        'the source would be # mm from a phantom that is # mm large, closer than in a '
+        'fluoroscope: the principal distance is wrong, or the images are from a wide-angle camera'
     ),
     Kind.WRONG_IMAGE_SIZE: (
         'the image points reach only to u = #, v = # of an image of # x # px: the image size '
         'is wrong, or the phantom covers one corner only'
     ),
     Kind.WRONG_KNOWN_ORIENTATION: (
-        'fluoroscope a: the known orientation does not fit, image points are # px off in the '
-        'median: check the unit and the frame of the lab, that R and t lead from the lab to '
-        'the sensor, and that v runs down'
+        'fluoroscope a: the known orientation does not fit: the median error of the image points '
+        'is # px: check the unit and the frame of the lab, that R and t transform from the lab '
+        'to the sensor, and that v runs down'
     ),
     Kind.WRONG_UNIT: (
         'the coordinates of the phantom are not in mm: it would be # mm large and # mm from '
@@ -716,25 +713,24 @@ SENTENCES = {
     ),
     Kind.LARGE_RESIDUALS: (
         'the residuals are too large: RMSE # px after the correction, at most # px are '
-        'plausible; false matches, another phantom, or the distortion changed between the '
-        'exposures'
+        'plausible; possible causes: false matches, another phantom, or a change of the '
+        'distortion between the exposures'
     ),
     Kind.PRINCIPAL_POINT_OFF: (
         'the principal point (#, #) is # px from the centre of the image: wrong target ids, a '
         'wrong image size, or another phantom'
     ),
     Kind.WRONG_PRINCIPAL_DISTANCE: (
-        'the principal distance is fixed at # px, but the exposures show about # px: it has to '
-        'be given in pixels'
+        'the principal distance is fixed at # px, but the exposures show about # px: give it in '
+        'pixels'
     ),
     Kind.CORRECTED_ALREADY: (
         'fluoroscope a: the image points are already corrected, their RMSE is # px with the '
-        'correction and # px without: give the observed ones'
+        'correction and # px without: give the observed image points'
     ),
     Kind.POOR_CALIBRATION_FIT: (
         'fluoroscope a: RMSE # px with the calibration fixed, # times the noise with which it '
-        'was determined: the image has changed, or the calibration is that of another '
-        'fluoroscope'
+        'was determined: the image has changed, or the calibration is of another fluoroscope'
     ),
     Kind.NO_COMMON_TARGETS: (
         'no target is seen by two fluoroscopes in one exposure: the target ids of the '
@@ -747,14 +743,14 @@ SENTENCES = {
     Kind.PAIRS_CONTRADICT: (
         'orientation of the rig: the exposures contradict each other: the relative orientation '
         'of fluoroscopes a and b differs between them by # px, # times its standard deviation; '
-        'frames with the same number are not of the same exposure, the phantom moved between '
-        'them, the fluoroscopes or their images do not stand still, or the corrections do not '
-        'hold in all of them'
+        'frames with the same number are from different exposures, the phantom moved between '
+        'them, a fluoroscope or its image is unstable, or the corrections do not hold in all of '
+        'them'
     ),
     Kind.PAIRS_EXCLUDED: (
         'orientation of the rig: not from exposure #, in which fluoroscopes a and b stand '
-        'otherwise to each other by # px: the frames are not of one exposure, or the phantom '
-        'moved between them'
+        'otherwise to each other by # px: the frames are from different exposures, or the '
+        'phantom moved between them'
     ),
     Kind.RAYS_DO_NOT_MEET: (
         '# % of the rays miss each other: the frames, target ids or image coordinates do not '
@@ -763,8 +759,8 @@ SENTENCES = {
     ),
     Kind.RIG_DEPENDS_ON_ANGLE: (
         'orientation of the rig: the relative orientation of fluoroscopes a and b changes with '
-        'the angle of the C-arm, by # px: it is that of the mean angle; orient the rig from a '
-        'capture at the angle that is used'
+        'the angle of the C-arm, by # px: it holds for the mean angle; orient the rig from a '
+        'capture at the angle in use'
     ),
     Kind.RIG_MOVED: (
         'fluoroscopes a and b stand otherwise to each other than in the orientation before, by '
@@ -830,17 +826,16 @@ SENTENCES = {
         'of them was exchanged; restore the files of one calibration, or calibrate again'
     ),
     Kind.CLUSTER_CHANGE: (
-        'WARN: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper '
-        'left quarter, about (#, #) px, for # s, held against the start; seen in cluster '
-        'bone, in which a bead may have moved, as no other cluster shows it'
+        'WARN: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper left '
+        'quarter, about (#, #) px, for # s, relative to the start; seen in cluster bone, where a '
+        'bead may have moved, since no other cluster shows the drift'
     ),
     Kind.IMAGE_DRIFT: (
-        'ERROR: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper '
-        'left quarter, about (#, #) px, for # s, held against the start; seen in the '
-        'epipolar residuals'
+        'ERROR: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper left '
+        'quarter, about (#, #) px, for # s, relative to the start; seen in the epipolar residuals'
     ),
-    Kind.LEARNING: 'the start is being learned',
-    Kind.NO_DRIFT: 'no drift is seen',
+    Kind.LEARNING: 'the reference is being learned',
+    Kind.NO_DRIFT: 'no drift detected',
     Kind.FEW_MARKERS: 'only # of # markers are where they are said to be at first',
     Kind.BODY_MIRRORED: (
         'body femur: its coordinates are mirrored: the points in space deviate from them by # '
@@ -900,7 +895,7 @@ SENTENCES = {
     ),
     Kind.SHORT_RECORDING: (
         'the recording is too short to detect a drift: it has # s, of which the first # s are '
-        'learned'
+        'the reference'
     ),
     Kind.WIDENED_BY_ALARM: (
         'rays miss each other by # px (RMS): until the rig is healed, the standard deviation of '

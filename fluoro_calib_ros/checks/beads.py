@@ -82,8 +82,8 @@ class DisplacedLayer:
             )
         x, y, z = self.shift_mm
         return (
-            f'{layer} ({len(self.target_id)} beads) is displaced as a whole against its survey: '
-            f'by {np.linalg.norm(self.shift_mm):.1f} mm ({x:.1f}, {y:.1f}, {z:.1f}) and tilted by '
+            f'{layer} ({len(self.target_id)} beads) is displaced against its survey by '
+            f'{np.linalg.norm(self.shift_mm):.1f} mm ({x:.1f}, {y:.1f}, {z:.1f}) and tilted by '
             f'{np.rad2deg(self.tilt_rad):.2f} deg'
         )
 
@@ -333,9 +333,9 @@ def _rejected(target_id: NDArray[np.int64]) -> Check:
     return Check(
         Kind.BEADS,
         f'most image points of bead {first_few(target_id)} are rejected, more than false matches '
-        'explain: its survey is wrong, or it is exchanged with another',
+        'explain: its survey is wrong, or it is exchanged with another bead',
         Place(target_id=tuple(target_id.tolist())),
-        'survey again, and calibrate again',
+        'survey it again, and calibrate again',
         numbers={'beads': len(target_id)},
         value=len(target_id),
         limit=0,
@@ -348,9 +348,9 @@ def _exchanged(pairs: NDArray[np.int64]) -> Check:
     return Check(
         Kind.BEADS,
         f'bead {first_few(f"{first} is exchanged with {second}" for first, second in pairs)} in '
-        "the survey: their image points lie at each other's place",
+        'the survey: the image points of each lie where the other is expected',
         Place(target_id=tuple(pairs.ravel().tolist())),
-        'exchange them in the file of the phantom, and calibrate again',
+        'exchange them in the phantom file, and calibrate again',
         numbers={'beads': pairs.size},
         value=pairs.size,
         limit=0,
@@ -423,7 +423,7 @@ def _not_made(kind: Kind, count: int) -> Check:
     return Check(
         kind,
         f'check {kind.value} could not be performed, only {count} beads are seen often enough to '
-        'be found from the images alone',
+        'be located from the images alone',
         advice='take more exposures',
         numbers={'beads': count},
     )
@@ -447,11 +447,11 @@ def _check_distances(beads: Beads, has_trend: bool) -> Check:
     by_chance = float(np.sqrt(chdtri(measured.freedom, FALSE_ALARM) / measured.freedom))
     return Check(
         Kind.DISTANCES,
-        f'distances between beads differ from the survey by {measured.rmse_mm:.3f} mm, '
-        f'{measured.expected_mm:.3f} mm are expected (scale {1 + measured.scale:.6f}, '
-        f'sd {measured.scale_sd:.6f})',
-        advice='the survey is less precise than its sd says, or the calibration is wrong if other '
-        'checks fail too; survey the phantom again, or give a larger sd',
+        f'distances between beads differ from the survey by {measured.rmse_mm:.3f} mm, where '
+        f'{measured.expected_mm:.3f} mm is expected (scale {1 + measured.scale:.6f}, sd '
+        f'{measured.scale_sd:.6f})',
+        advice='the survey is less precise than its sd states, or, if other checks fail too, the '
+        'calibration is wrong; survey the phantom again, or give a larger sd',
         numbers={'scale': 1 + measured.scale, 'scale_sd': measured.scale_sd},
         value=measured.rmse_mm,
         limit=max(DISTANCES_LIMIT, by_chance) * measured.expected_mm,

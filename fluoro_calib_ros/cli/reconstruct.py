@@ -62,8 +62,8 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
         error('--cluster is for the drift watch, it cannot be used with --no-drift-watch')
     if arguments.bodies and not is_bag(arguments.source):
         error(
-            f'--cluster is for the drift watch, but {arguments.source}, which is no bag, '
-            'does not contain the times of its exposures'
+            '--cluster is for the drift watch, which needs the times of the exposures: '
+            f'{arguments.source} is not a bag'
         )
 
 

@@ -192,7 +192,7 @@ def robust_dlt(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.
         raise DataError('all targets lie in one place')
     if extent[2] < MIN_FLATNESS * extent[0]:
         raise DataError(
-            'all targets lie in one plane, from which the principal distance cannot be found'
+            'all targets lie in one plane, which does not determine the principal distance'
         )
     spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_FLATNESS * spread[0]:

@@ -135,7 +135,8 @@ class RigOrientation:
                 )
         if self.source not in SOURCES:
             raise DataError(
-                f'rig orientation: its source is one of {", ".join(SOURCES)}, not {self.source!r}'
+                f'rig orientation: its source must be one of {", ".join(SOURCES)}, not '
+                f'{self.source!r}'
             )
         if not str(self.frame_id):
             raise DataError('rig orientation: the rig frame has no name')

@@ -614,8 +614,8 @@ SENTENCES = {
         'fluoroscope a, exposure #: only # % of the image points fit, the others are false matches'
     ),
     Kind.FEW_RAYS: (
-        '# targets are seen in fewer than # exposures, which do not determine them safely '
-        'without surveyed coordinates: #, #, #, #, # and # more'
+        '# targets are seen in fewer than # exposures, too few to determine them without '
+        'surveyed coordinates: #, #, #, #, # and # more'
     ),
     Kind.FEW_TARGETS: 'fluoroscope a, exposure #: # targets are too few, # are needed',
     Kind.NOT_ORIENTED: (
@@ -643,8 +643,8 @@ SENTENCES = {
         'more'
     ),
     Kind.UNTILTED_TARGETS: (
-        'fluoroscope a: the targets are flat and not tilted, so that the principal distance '
-        'cannot be found: tilt the target by # degrees and more, or give the principal distance'
+        'fluoroscope a: the targets are flat and not tilted: the principal distance is '
+        'undetermined: tilt the target by # degrees and more, or give the principal distance'
     ),
     Kind.DUPLICATE_NAME: (
         'fluoroscopes a and A differ only in case: use one name for one fluoroscope, or rename '

@@ -46,8 +46,7 @@ START_GROSS = 0.01  # initial share of gross errors when the noise is estimated
 ADVICE = 'add exposures with the phantom turned and moved'
 TOO_FLAT = replace(
     UNTILTED,
-    cause='the targets are flat and tilted too little, so that the principal distance cannot be '
-    'found',
+    cause='the targets are flat and tilted too little to determine the principal distance',
 )
 SINGULAR = f'the exposures do not determine the unknowns: the normal matrix is singular; {ADVICE}'
 

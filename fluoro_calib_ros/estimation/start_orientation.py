@@ -57,8 +57,8 @@ DISTANCES = (0.5, 30.0)
 
 UNTILTED = Finding(
     Kind.UNTILTED_TARGETS,
-    'the targets are flat and not tilted, so that the principal distance cannot be found',
-    advice='tilt the target by 20 degrees and more, or give the principal distance',
+    'the targets are flat and not tilted: the principal distance is undetermined',
+    advice='tilt the target by 20 degrees or more, or give the principal distance',
 )
 
 

@@ -148,7 +148,7 @@ class MeasuredDistance:
         if self.first == self.second:
             raise DataError('both ends are the same bead', place=place)
         if not (0 < self.length_mm < np.inf and 0 < self.sd_mm < np.inf):
-            raise DataError('length and standard deviation are numbers above 0', place=place)
+            raise DataError('length and standard deviation must be above 0', place=place)
 
     @property
     def name(self) -> str:
@@ -257,8 +257,8 @@ def _rows(distances: Sequence[MeasuredDistance], target_id: NDArray[np.int64]) -
         for end in (distance.first, distance.second):
             if end not in target_id:
                 raise DataError(
-                    f'bead {end} is not found from the images: it is not on the phantom, or too '
-                    'few exposures show it',
+                    f'bead {end} cannot be located from the images: it is not on the phantom, or '
+                    'too few exposures show it',
                     kind=Kind.FEW_RAYS,
                     place=Place(target_id=(end,), name=distance.name),
                 )

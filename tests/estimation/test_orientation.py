@@ -228,7 +228,7 @@ def test_more_precise_targets_give_a_more_precise_orientation():
     [
         (
             lambda f, c: ({'a': f['a']}, c),
-            'a rig has two fluoroscopes or more, there are frames of a only',
+            'a rig needs two fluoroscopes or more, there are frames of a only',
         ),
         (lambda f, c: (f, {'a': c['a']}), 'there is no calibration of fluoroscope b, only of a'),
         (lambda f, c: ({**f, 'b': []}, c), 'fluoroscope b: there is no frame of the phantom'),
@@ -371,8 +371,8 @@ def test_exposures_that_do_not_belong_together_are_refused():
     apart = {'a': frames['a'], 'b': [replace(f, number=f.number + 100) for f in frames['b']]}
     with pytest.raises(
         DataError,
-        match='fluoroscopes a and b: no exposures have the same number, so that their '
-        'relative orientation is not known',
+        match='fluoroscopes a and b: no exposures have the same number, so their relative '
+        'orientation is unknown',
     ):
         orientation_and_scatter(apart, rig().phantom, calibrations())[0]
 

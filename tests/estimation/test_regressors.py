@@ -154,7 +154,7 @@ def test_regressors_of_one_output_and_of_few_samples():
     assert few.n_neighbors_ == 50 and np.isfinite(few.predict(uv)).all()
     with pytest.raises(ValueError):
         KnnRegressor(51).fit(uv, duv).predict(uv)
-    with pytest.raises(ValueError, match='n_neighbors is at least 1, not 0'):
+    with pytest.raises(ValueError, match='n_neighbors must be at least 1, not 0'):
         LocalLinearRegressor(0).fit(uv, duv)
     alike = LocalLinearRegressor(4, None).fit(
         np.array([[0, 1], [1, 0], [0, -1], [-1.0, 0]]), duv[:4]

@@ -380,7 +380,7 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
             (off_phantom & single_stray & ~off_image, 'not on the phantom'),
             (
                 coincident,
-                'at the image point of others, a fill value for targets that are not seen',
+                'at the same image point as others, a fill value for targets that are not seen',
             ),
         )
         if mask.any()

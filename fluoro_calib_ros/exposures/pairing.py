@@ -57,7 +57,8 @@ class PairingOptions:
     )
     patience: int = option(
         PATIENCE,
-        'frames of two others for which a silent one of three or more fluoroscopes is awaited',
+        'with three or more fluoroscopes: frames of two others after which a silent one is given '
+        'up',
         minimum=1,
         maximum=10000,
     )

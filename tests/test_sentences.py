@@ -786,17 +786,18 @@ SENTENCES = {
         'instead of #); mark it by beads that break its symmetry'
     ),
     Kind.MARKER_FOUND_AGAIN: 'found again after # images',
-    Kind.MARKER_MOVES_ALONE: 'it moves unlike the markers that it moved with',
-    Kind.OTHER_SHADOW: 'another shadow was as near to where it was expected',
-    Kind.SHADOWS_MET: 'their shadows met and parted',
+    Kind.MARKER_MOVES_ALONE: 'it no longer moves with its former neighbours',
+    Kind.OTHER_SHADOW: 'another shadow was as close to its prediction',
+    Kind.SHADOWS_MET: 'their shadows overlapped and separated',
     Kind.NOT_IN_BOTH: 'fluoroscope b is in one only',
     Kind.WRONG_FORMAT: (
         'cam.csv: this looks like MayaCam # (mayacam2), which has cameras, but a phantom is needed'
     ),
     Kind.FEW_BEADS: 'only # beads are found in the image, at least # are needed',
     Kind.GRID_NOT_MARKED: (
-        'the grid is taken as one without marks: ids count from the hole nearest to the middle of '
-        'each image: this serves the distortion of one fluoroscope, not the orientation of two'
+        'the grid is treated as unmarked: ids count from the hole nearest to the centre of each '
+        'image: this suffices for the distortion of one fluoroscope, not for the orientation of '
+        'two'
     ),
     Kind.SHADOWS_BENT: (
         'fluoroscope a: the distortion within the large shadows shifts their centres by # px '
@@ -807,12 +808,12 @@ SENTENCES = {
     Kind.IMAGE_EMPTY: 'the image is empty: every pixel has the grey value #',
     Kind.NO_POSE: 'no pose of the phantom fits the beads in the image',
     Kind.POSE_UNSURE: ('the best pose of the phantom explains only #% of the beads in the image'),
-    Kind.BEAD_ALONE: 'its neighbours are not found',
+    Kind.BEAD_ALONE: 'its neighbours were not found',
     Kind.BEAD_AWAY: '# px from its prediction',
-    Kind.BEAD_CONTRAST: 'a shadow of #% of that of a bead',
-    Kind.BEAD_DISTURBED: 'something else is beside it',
+    Kind.BEAD_CONTRAST: 'a contrast of #% of that of a bead',
+    Kind.BEAD_DISTURBED: 'another object is next to it',
     Kind.BEAD_HIDDEN: 'hidden by another bead',
-    Kind.BEAD_UNSURE: 'sigma # px, that of most is # px',
+    Kind.BEAD_UNSURE: 'sigma # px, that of most beads is # px',
     Kind.BEADS_NOT_MEASURED: (
         'the phantom is found with # beads, of which only # can be measured'
     ),

@@ -342,15 +342,15 @@ def _nothing(image: np.ndarray, sight: _Sight) -> DataError:
         share = np.count_nonzero(image == value) / image.size
         if share > 0.5:
             cause = (
-                f'there are no beads in the image, {share:.0%} of it are {text} '
-                f'(grey value {value:.0f})'
+                f'there are no beads in the image, {share:.0%} of it is {text} (grey value '
+                f'{value:.0f})'
             )
             return DataError(cause, kind=Kind.IMAGE_EMPTY, numbers={'share': share})
     contrast = sight.contrast()
-    cause = 'there are no beads in the image, nothing round rises above the noise'
+    cause = 'there are no beads in the image, no round shadow rises above the noise'
     if contrast:
         cause = (
-            'there are no beads in the image: the contrast of what is round in it is at most '
+            'there are no beads in the image: the contrast of its round shadows is at most '
             f'{contrast:.1%}, at least {MIN_CONTRAST:.0%} are needed'
         )
     return DataError(cause, kind=Kind.FEW_BEADS, numbers={'contrast': contrast})

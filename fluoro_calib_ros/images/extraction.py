@@ -43,10 +43,10 @@ MIN_ACCEPTED = 0.5  # least share of the matched beads that are measured well
 MIN_SCATTER_PX = 0.05
 # Reasons why predicted beads are not observed, without a number.
 LOST = Finding(Kind.BEAD_LOST, 'cut off, or lost while it was measured')
-DISTURBED = Finding(Kind.BEAD_DISTURBED, 'something else is beside it')
+DISTURBED = Finding(Kind.BEAD_DISTURBED, 'another object is next to it')
 HIDDEN = Finding(Kind.BEAD_HIDDEN, 'hidden by another bead')
 VAGUE = (Kind.BEAD_UNSURE, Kind.BEAD_HIDDEN)
-ALONE = Finding(Kind.BEAD_ALONE, 'its neighbours are not found')
+ALONE = Finding(Kind.BEAD_ALONE, 'its neighbours were not found')
 
 
 @dataclass(frozen=True)
@@ -282,13 +282,13 @@ def _checked(
     reasons = list(measured.reasons)
     for number in np.flatnonzero(_away(measured)):
         off = float(measured.residual[number])
-        cause = f'{off:.2f} px from where its neighbours say'
+        cause = f'{off:.2f} px from the prediction of its neighbours'
         reasons[number] = Finding(Kind.BEAD_AWAY, cause, numbers={'off_px': off})
     good = np.array([reason is None for reason in reasons], dtype=bool)
     usual = float(np.median(beads.sigma[good]))
     vague = good & (beads.sigma > max(SURE_SIGMA_PX, MAX_SIGMAS * usual))
     for number in np.flatnonzero(vague):
-        cause = f'sigma {beads.sigma[number]:.2f} px, that of most is {usual:.2f} px'
+        cause = f'sigma {beads.sigma[number]:.2f} px, that of most beads is {usual:.2f} px'
         reasons[number] = Finding(
             Kind.BEAD_UNSURE, cause, numbers={'sigma_px': float(beads.sigma[number])}
         )
@@ -421,7 +421,7 @@ def _reasons(beads: Beads, predicted: NDArray[np.float64]) -> list[Finding | Non
         if not beads.measured[number]:
             reason = LOST
         elif not DEPTH[0] < depth < DEPTH[1]:
-            cause = f'a shadow of {depth:.0%} of that of a bead'
+            cause = f'a contrast of {depth:.0%} of that of a bead'
             reason = Finding(Kind.BEAD_CONTRAST, cause, numbers={'depth': depth})
         elif beads.misfit[number] > MAX_MISFIT:
             reason = DISTURBED

@@ -40,9 +40,8 @@ STEPS = 3  # number of steps of the refinement
 # Note on images of a grid of which any place is accepted.
 NOT_MARKED = Finding(
     Kind.GRID_NOT_MARKED,
-    'the grid is taken as one without marks: ids count from the hole nearest to the middle of '
-    'each image',
-    advice='this serves the distortion of one fluoroscope, not the orientation of two',
+    'the grid is treated as unmarked: ids count from the hole nearest to the centre of each image',
+    advice='this suffices for the distortion of one fluoroscope, not for the orientation of two',
     severity=Severity.NOTE,
 )
 

@@ -231,7 +231,7 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
     if best.count < min_count:
         raise DataError(
             f'body {body.name}: its shape fits in more than one way in this exposure, its '
-            'distances do not tell the markers apart'
+            'distances do not distinguish the markers'
         )
     return best
 

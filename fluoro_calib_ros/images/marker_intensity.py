@@ -240,7 +240,7 @@ def _learn_look(
         elif best.clear:
             break  # beyond the size of the markers, the response decreases
     assert best is not None
-    return best.look('there is nothing round where the markers should be'), best.light
+    return best.look('there is no round shadow where the markers are expected'), best.light
 
 
 def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
@@ -252,7 +252,7 @@ def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
     best = max(
         (_Typical.strongest(light, count) for light in lights), key=lambda typical: typical.snr
     )
-    look = best.look('there are no markers in the image, nothing round rises above the noise')
+    look = best.look('there are no markers in the image, no round shadow rises above the noise')
     return _found(look, best.light)
 
 

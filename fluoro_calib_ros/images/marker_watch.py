@@ -162,10 +162,10 @@ class MarkerWatch:
 
 # Reasons why an id may be wrong.
 DOUBTS = {
-    Kind.SHADOWS_MET: 'their shadows met and parted',
+    Kind.SHADOWS_MET: 'their shadows overlapped and separated',
     Kind.MARKER_FOUND_AGAIN: 'found again after {images} images',
-    Kind.OTHER_SHADOW: 'another shadow was as near to where it was expected',
-    Kind.MARKER_MOVES_ALONE: 'it moves unlike the markers that it moved with',
+    Kind.OTHER_SHADOW: 'another shadow was as close to its prediction',
+    Kind.MARKER_MOVES_ALONE: 'it no longer moves with its former neighbours',
 }
 
 

@@ -47,7 +47,7 @@ class MarkerOptions:
 
     gate: float = option(
         4.5,
-        'distance from its prediction within which a marker is looked for',
+        'largest distance from its prediction at which a marker is searched for',
         minimum=1,
         maximum=20,
         unit='standard deviations',
@@ -60,7 +60,7 @@ class MarkerOptions:
     )
     search_every: int = option(
         30,
-        'images in which the whole image is searched, in strips, where a marker is lost',
+        'images over which the search of the whole image for a lost marker is spread, in strips',
         minimum=1,
         maximum=100000,
         unit='images',

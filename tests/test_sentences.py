@@ -819,12 +819,12 @@ SENTENCES = {
     ),
     Kind.BEAD_LOST: 'cut off, or lost while it was measured',
     Kind.EDITED_RESULT: (
-        'result/result.json: the file was changed after it was written, its figures need not '
-        'be those of the calibration: restore it, or calibrate again'
+        'result/result.json: the file was changed after it was written, its figures may not '
+        'match the calibration: restore it, or calibrate again'
     ),
     Kind.EXCHANGED_CALIBRATION: (
-        'result: the calibration file of a and result.json are of different calibrations: one '
-        'of them was exchanged; restore the files of one calibration, or calibrate again'
+        'result: the calibration file of a and result.json belong to different calibrations: one '
+        'of them was replaced; restore the files of one calibration, or calibrate again'
     ),
     Kind.CLUSTER_CHANGE: (
         'WARN: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper left '

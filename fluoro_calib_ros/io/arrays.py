@@ -162,7 +162,7 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
         last = layout.version
         known_versions = 'version 1' if last == 1 else f'versions 1 to {last}'
         raise DataError(
-            f'{path}: the file has layout version {int(version)}, this program knows '
+            f'{path}: the file has layout version {int(version)}, this program reads '
             f'{known_versions}'
         )
     return int(version)
@@ -202,8 +202,7 @@ def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndar
 
 def _no_plain_array(path: PathLike, name: str) -> DataError:
     return DataError(
-        f'{path}: the array {name} does not contain plain numbers or text, and nothing else is '
-        'read'
+        f'{path}: the array {name} does not contain plain numbers or text, only these are read'
     )
 
 

@@ -203,7 +203,7 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
     for key in (*REQUIRED, 'side'):
         value = table.get(key, '' if key == 'side' else None)
         if not isinstance(value, str) or (not value and key != 'side'):
-            raise DataError(f'{where}, key {key}: a text is expected')
+            raise DataError(f'{where}, key {key}: expected a text')
         texts[key] = value
     try:
         joint_convention = convention(texts['convention'])
@@ -231,7 +231,9 @@ def _neutral(where: str, value: Any) -> tuple[int, int] | None:
         return None
     are_integers = isinstance(value, list) and all(type(v) is int for v in value)
     if not are_integers or len(value) != 2 or not 0 <= value[0] <= value[1]:
-        raise DataError(f'{where}, key neutral: first and last exposure, such as [1, 100]')
+        raise DataError(
+            f'{where}, key neutral: expected first and last exposure, such as [1, 100]'
+        )
     return value[0], value[1]
 
 

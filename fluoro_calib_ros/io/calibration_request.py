@@ -152,8 +152,8 @@ def read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
     document = read_json(_require_file(path))
     if document.get('format_version') != VERSION:
         raise DataError(
-            f'{path}: the file has layout version {document.get("format_version")}, '
-            f'this program knows version {VERSION}'
+            f'{path}: the file has layout version {document.get("format_version")}, this program '
+            f'reads version {VERSION}'
         )
     try:
         options = CalibrationOptions(**document['options'])

@@ -180,7 +180,7 @@ def clean_up(path: PathLike) -> None:
     """
     target = os.path.realpath(path)
     parent = os.path.dirname(target)
-    with os_errors(path, 'what an earlier run left behind cannot be cleaned up'):
+    with os_errors(path, 'files left by an earlier run cannot be removed'):
         for folder in (parent, target):
             for leftover in _leftovers(folder, os.path.basename(target)):
                 if not _is_locked(leftover):

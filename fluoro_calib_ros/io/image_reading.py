@@ -48,7 +48,7 @@ def read_image_angles(path: PathLike) -> dict[int, float]:
         block.require('angle_deg', valid, 'not an angle')
         for index, (number, angle) in enumerate(zip(numbers.tolist(), np.radians(degrees))):
             if number in rows:
-                block.fail(index, f'image {number} is in row {rows[number]}, too')
+                block.fail(index, f'image {number} is already in row {rows[number]}')
             rows[number] = int(block.lines[index])
             if not np.isnan(angle):
                 angles[number] = float(angle)
@@ -206,7 +206,7 @@ def open_images(path: Path) -> ImageSource:
         return _open_dicom(path)
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(
-            f'the ending {suffix_of(path) or "(none)"} is none of an image or a video '
+            f'the suffix {suffix_of(path) or "(none)"} is not that of an image or a video '
             f'({listed(READ_SUFFIXES)})',
             at=path,
         )

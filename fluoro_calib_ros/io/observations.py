@@ -483,8 +483,8 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     )
     if CORRECTED_BY in header:
         raise DataError(
-            f'{path}: the image points are already corrected, as its column {CORRECTED_BY} says: '
-            'give the observed ones'
+            f'{path}: the image points are already corrected, according to its column '
+            f'{CORRECTED_BY}: give the observed image points'
         )
     for name in points.added_columns:
         if name in header:

@@ -317,7 +317,7 @@ def changed(lines, row, text):
     ('row', 'text', 'sentence'),
     [
         (2, '1024', 'row 2: 1 numbers, but MayaCam 2.0 has 2 here'),
-        (4, 'camera', "row 4: 'camera' stands where MayaCam 2.0 has the line 'camera matrix'"),
+        (4, 'camera', "row 4: 'camera' is where MayaCam 2.0 has the line 'camera matrix'"),
         (6, '0,x,1', "row 6: column 2 is 'x', not a number"),
         (10, '1,1,1', 'row 10: the matrix is not a rotation, its rows are not orthonormal'),
     ],

@@ -595,7 +595,7 @@ def _faults(report: TopicReport) -> list[str]:
     if report.repeated_frames:
         faults.append(f'{report.repeated_frames} frame numbers are repeated')
     if report.restarts:
-        faults.append(f'the frame numbers begin again {_times(report.restarts)}')
+        faults.append(f'the frame numbers restart {_times(report.restarts)}')
     if report.undecodable:
         faults.append(f'{report.undecodable} messages are too short for their type')
     return faults

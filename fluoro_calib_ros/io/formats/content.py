@@ -263,7 +263,7 @@ class FileSettings:
         """Return the unit in mm for a file that does not state it. Raises DataError if not set."""
         if self.units is None:
             raise DataError(
-                f'{where}: this format does not say the unit of its lengths, --units '
+                f'{where}: this format does not state the unit of its lengths, --units '
                 f'{"|".join(UNITS_MM)} is needed'
             )
         return UNITS_MM[self.units]
@@ -272,7 +272,9 @@ class FileSettings:
         """Return the unit in mm, and a note if it is the default of the format."""
         if self.units is not None:
             return UNITS_MM[self.units], ()
-        note = f'{what}: lengths in {default}, as the format does not say a unit; change it with '
+        note = (
+            f'{what}: lengths in {default}, as the format does not state a unit; change it with '
+        )
         return UNITS_MM[default], (note + '--units',)
 
 

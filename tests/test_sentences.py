@@ -763,9 +763,9 @@ SENTENCES = {
         'capture at the angle in use'
     ),
     Kind.RIG_MOVED: (
-        'fluoroscopes a and b stand otherwise to each other than in the orientation before, by '
-        '# mm and # degrees (distance of the sources # times): one of them was moved since, '
-        'the frames are not of one exposure, or this is another phantom'
+        'the relative orientation of fluoroscopes a and b differs from the previous one by # mm '
+        'and # degrees (distance of the sources # times): one of them was moved since, the '
+        'frames are from different exposures, or this is another phantom'
     ),
     Kind.RIG_NOTE: 'orientation of the rig: not from exposure #',
     Kind.RIG_NOT_ORIENTED: (
@@ -801,8 +801,8 @@ SENTENCES = {
     ),
     Kind.SHADOWS_BENT: (
         'fluoroscope a: the distortion within the large shadows shifts their centres by # px '
-        '(RMS); some # px of it may be left in the correction, beyond what that claims: smaller '
-        'beads have less of it, with the square of their size'
+        '(RMS); some # px of it may remain in the correction, in addition to its standard '
+        'deviation: smaller beads reduce it, with the square of their size'
     ),
     Kind.IMAGE_ENCODING: 'the image has pixels of float64, not of # or # bits',
     Kind.IMAGE_EMPTY: 'the image is empty: every pixel has the grey value #',
@@ -837,7 +837,7 @@ SENTENCES = {
     ),
     Kind.LEARNING: 'the reference is being learned',
     Kind.NO_DRIFT: 'no drift detected',
-    Kind.FEW_MARKERS: 'only # of # markers are where they are said to be at first',
+    Kind.FEW_MARKERS: 'only # of # markers are at their given initial positions',
     Kind.BODY_MIRRORED: (
         'body femur: its coordinates are mirrored: the points in space deviate from them by # '
         'mm, and from their mirror image by # mm'
@@ -863,30 +863,30 @@ SENTENCES = {
     ),
     Kind.MARKERS_EXCHANGED: 'body femur: markers # and # are exchanged in CT or in the images',
     Kind.CAUSE_SURE: (
-        'fluoroscope a: source and detector have moved against each other; or fluoroscope b: it '
-        'has moved against the other fluoroscope, or that one against it; the recording does not '
-        'tell which: record more motion, or calibrate with the phantom'
+        'fluoroscope a: source and detector have moved relative to each other; or fluoroscope b: '
+        'it has moved relative to the other fluoroscope, or vice versa; the recording does not '
+        'decide which: record more motion, or calibrate with the phantom'
     ),
     Kind.CHANGE_IDENTIFIED: (
-        'the direction of the change that is known worst has a standard deviation of # % of what '
-        'such a change may be: record bodies that move through more of the field of view'
+        'the least certain direction of the change has a standard deviation of # % of the size '
+        'that such a change may have: record bodies that move through more of the field of view'
     ),
     Kind.COMMON_MOTION: (
-        'all points together may have moved by # mm (RMS) in the rig frame, which no body shows'
+        'a common motion of all points by # mm (RMS) in the rig frame may be undetected'
     ),
     Kind.DISTORTION_CHANGED: 'fluoroscope a: the distortion has changed',
     Kind.FLUOROSCOPE_MOVED: (
-        'fluoroscope a: it has moved against the other fluoroscope, or that one against it'
+        'fluoroscope a: it has moved relative to the other fluoroscope, or vice versa'
     ),
-    Kind.INTERIOR_CHANGED: 'fluoroscope a: source and detector have moved against each other',
+    Kind.INTERIOR_CHANGED: 'fluoroscope a: source and detector have moved relative to each other',
     Kind.UNSEEN_DISTORTION: (
-        'a change of the distortion that no body shows may have moved points by # mm (RMS) '
-        'relative to each other where the markers were, and by more elsewhere: record more '
-        'bodies, or bodies that move through more of the field of view'
+        'an undetected change of the distortion may have moved points by # mm (RMS) relative to '
+        'each other where the markers were, and by more elsewhere: record more bodies, or bodies '
+        'that move through more of the field of view'
     ),
     Kind.UNUSED_EXPOSURES: (
         'the first half of the exposures that were not used: fluoroscope a: source and detector '
-        'have moved against each other: the rig changes while it is recorded: take another '
+        'have moved relative to each other: the rig changes while it is recorded: take another '
         'recording, or calibrate with the phantom'
     ),
     Kind.NO_MARKERS: 'no markers were seen',

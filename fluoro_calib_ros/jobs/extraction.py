@@ -224,7 +224,7 @@ def bent_shadows(fluoroscope: str, results: Sequence[ImageResult]) -> Finding | 
         f'the distortion within the large shadows shifts their centres by {bent_px:.3f} px (RMS); '
         f'some {remaining_px:.3f} px of it may be left in the correction, beyond what that claims',
         Place((fluoroscope,)),
-        advice='smaller beads have less of it, with the square of their size',
+        advice='smaller beads reduce it, with the square of their size',
         severity=Severity.WARNING,
         numbers={'bent_px': bent_px, 'left_px': remaining_px},
     )
@@ -397,10 +397,7 @@ def _mirrored(
         task = _task(request, (flipped,), _first_lens(request, flipped.image))
         (result,) = _extract(replace(task, overlay=False))
         if result.frame is not None:
-            cause = (
-                'the image is mirrored, the phantom is found in it when left and right are '
-                'interchanged'
-            )
+            cause = 'the image is mirrored, the phantom is found with left and right interchanged'
             advice = 'flip the images before they are extracted'
             place = Place(name=source.place)
             return _first_of(results, Finding(Kind.IMAGE_MIRRORED, cause, place, advice))

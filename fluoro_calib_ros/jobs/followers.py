@@ -214,8 +214,8 @@ def _model_of(beads: bytes, diameters: bytes | None, regular: bool) -> PhantomMo
 MIN_STARTED = 0.5  # minimum fraction of the given markers found in the first image
 REVISED = 300  # number of last images in which late decisions can retract ids
 DECIDED = {
-    'exchanged': 'were exchanged, which is undone from now on',
-    'dropped': 'is not what was followed, and is searched for',
+    'exchanged': 'were exchanged, which is corrected from now on',
+    'dropped': 'was confused with another object, and is searched for',
 }
 
 
@@ -395,7 +395,7 @@ def _wrong_start(found: MarkerFrame, expected: int) -> Finding | None:
         return found.finding
     return Finding(
         Kind.FEW_MARKERS,
-        f'only {count} of {expected} markers are where they are said to be at first',
+        f'only {count} of {expected} markers are at their given initial positions',
         numbers={'found': count, 'expected': expected},
     )
 
@@ -434,7 +434,7 @@ def _doubt_text(doubt: Finding) -> str:
     """Return a doubt in words."""
     markers = ' and '.join(map(str, doubt.place.target_id))
     suspicion = (
-        'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be something else'
+        'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be another object'
     )
     return f'markers {markers} {suspicion}: {doubt.cause}'
 

@@ -440,13 +440,13 @@ def _cause_text(change: Change, rig: _Rig) -> str:
     return {
         Cause.ORIENTATION: 'it has moved'
         if views > 2
-        else 'it has moved against the other fluoroscope, or that one against it',
-        Cause.INTERIOR: 'source and detector have moved against each other',
+        else 'it has moved relative to the other fluoroscope, or vice versa',
+        Cause.INTERIOR: 'source and detector have moved relative to each other',
         Cause.DISTORTION: 'the distortion has changed',
         Cause.MIGRATED: f'marker {ids} has migrated',
         Cause.EXCHANGED: f'the ids of markers {ids} are exchanged',
-        Cause.LOOSE: f'marker {ids} moves against the others',
-        Cause.SOFT: 'its markers move against each other: it is not rigid',
+        Cause.LOOSE: f'marker {ids} moves relative to the others',
+        Cause.SOFT: 'its markers move relative to each other: it is not rigid',
     }[change.cause]
 
 
@@ -465,9 +465,8 @@ def _unseen_distortion(distance_mm: float, noise_mm: float) -> Check:
     """Check that changes of distortion that bodies do not show are below the noise."""
     return Check(
         Kind.UNSEEN_DISTORTION,
-        'a change of the distortion that no body shows may have moved points by '
-        f'{distance_mm:.3f} mm (RMS) relative to each other where the markers were, and by more '
-        'elsewhere',
+        f'an undetected change of the distortion may have moved points by {distance_mm:.3f} mm '
+        '(RMS) relative to each other where the markers were, and by more elsewhere',
         advice='record more bodies, or bodies that move through more of the field of view',
         value=distance_mm,
         limit=noise_mm,
@@ -480,8 +479,8 @@ def _identified(weakest: float, is_healed: bool) -> Check:
     change = 'the change' if is_healed else 'a knock'
     return Check(
         Kind.CHANGE_IDENTIFIED,
-        f'the direction of {change} that is known worst has a standard deviation of '
-        f'{100 * weakest:.1f} % of what such a change may be',
+        f'the least certain direction of {change} has a standard deviation of '
+        f'{100 * weakest:.1f} % of the size that such a change may have',
         advice='record bodies that move through more of the field of view',
         value=weakest,
         limit=IDENTIFIED,
@@ -492,7 +491,8 @@ def _correctable(fixed: Sequence[str]) -> Check:
     """Return the failed check for a change of distortion that the models do not allow."""
     return Check(
         Kind.CHANGE_IDENTIFIED,
-        'its model of the distortion has no field of standard deviations, and takes no change',
+        'its model of the distortion has no field of standard deviations, to which a change '
+        'could be added',
         place=Place(tuple(fixed)),
         advice='calibrate with the phantom; the collocation can be healed',
         value=1.0,
@@ -512,7 +512,7 @@ def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
         text = f'{finding.place}: {finding.cause}'
         if rival is not None:
             text += f'; or {_place_of(rival, rig)}: {_cause_text(rival, rig)}'
-        text += '; the recording does not tell which'
+        text += '; the recording does not decide which'
     if not diagnosis.complete:
         doubt = 1.0
         text = f'{len(diagnosis.changes)} changes do not explain the recording'
@@ -547,7 +547,7 @@ def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
             advice='take a longer recording',
         )
     changes = [change for change in rest.changes if change.cause in OF_RIG]
-    text = f'{part} tells of no further change'
+    text = f'{part} shows no further change'
     if changes:
         text = f'{part}: {_place_of(changes[0], rig)}: {_cause_text(changes[0], rig)}'
     elif not rest.complete:

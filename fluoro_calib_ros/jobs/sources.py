@@ -276,8 +276,8 @@ def with_decisions(recording: Recording, path: PathLike | None) -> Recording:
     decisions = read_decisions(path, recording.names)
     frames, (exposures, points, renamed) = decided(recording.frames, decisions)
     note = (
-        f'{path}: by decision, {exposures} exposures and {points} further image points are left '
-        f'out, and {renamed} have another id'
+        f'{path}: by decision, {exposures} exposures and {points} further image points are '
+        f'excluded, and {renamed} have another id'
     )
     return replace(recording, frames=frames, notes=(*recording.notes, note))
 
@@ -338,8 +338,8 @@ def require_observed(path: object, corrected_by: Mapping[str, str]) -> None:
     for name, identity in corrected_by.items():
         raise DataError(
             f'{path}: the image points of fluoroscope {name} are already corrected, by the '
-            f'calibration {identity}: give the observed ones, or remove the column '
-            f'{CORRECTED_BY} where this is not so'
+            f'calibration {identity}: give the observed image points, or remove the column '
+            f'{CORRECTED_BY} if this is wrong'
         )
 
 

@@ -194,7 +194,7 @@ def test_commands_read_decisions(tmp_path, capsys):
     given = ('--phantom', tmp_path / 'phantom.csv', '--image-size', '1024x1024', '--fast')
     given += ('--decisions', table, '--max-iterations', '2')
     assert run('calibrate', tmp_path / 'seen.csv', *given, '--out', tmp_path / 'result') == 0
-    assert '1 exposures and 0 further image points are left out' in capsys.readouterr().err
+    assert '1 exposures and 0 further image points are excluded' in capsys.readouterr().err
     with (tmp_path / 'result' / 'exposures.csv').open() as file:
         used = {int(row['exposure']) for row in csv.DictReader(file)}
     assert used == {f.number for f in exposures()['a'][:7]} - {exposures()['a'][3].number}

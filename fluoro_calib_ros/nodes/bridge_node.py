@@ -170,7 +170,7 @@ class BridgeParameters:
     port: int = option(8765, 'port of the WebSocket; 0: any free one', minimum=0, maximum=65535)
     topics: tuple[str, ...] = option(('',), 'topics to show; empty: all')
     token: str = option(
-        '', 'what the address of a client ends with, ?token=...; empty: a new one at every start'
+        '', 'token that ends the address of a client, ?token=...; empty: a new one at every start'
     )
     origins: tuple[str, ...] = option(
         ('https://app.foxglove.dev',), 'web pages that may connect; others are refused'

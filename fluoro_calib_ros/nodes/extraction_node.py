@@ -76,7 +76,7 @@ MODES = ('phantom', 'markers')
 class ExtractionParameters(ManagedParameters):
     """Parameters of the extraction node."""
 
-    mode: str = option('phantom', 'what is looked for in the images', choices=MODES)
+    mode: str = option('phantom', 'what is extracted from the images', choices=MODES)
     phantom: str = option(
         '',
         'file phantom.csv with the surveyed coordinates of the beads, and with a column diameter '
@@ -85,7 +85,7 @@ class ExtractionParameters(ManagedParameters):
     )
     markers: str = option(
         '',
-        'for the mode markers: file with the ids of the markers and where they are in the first '
+        'for the mode markers: file with the ids and image points of the markers in the first '
         'image, as for fluoro-calib extract --markers; until an image shows them there, the node '
         'waits',
     )
@@ -93,7 +93,7 @@ class ExtractionParameters(ManagedParameters):
         '',
         'for the mode markers: folder with the calibrations and the orientation of all '
         'fluoroscopes, whose views then decide together on ids that may have been exchanged; '
-        'empty: each view by itself',
+        'empty: each view separately',
     )
     clusters: tuple[str, ...] = option(
         ('',),
@@ -102,9 +102,9 @@ class ExtractionParameters(ManagedParameters):
     )
     bodies: str = option(
         '',
-        'for the mode markers and two views or more: bodies.csv with rigid bodies and the places '
-        'of their markers, in the place of clusters; without the file markers, the shapes give '
-        'the ids',
+        'for the mode markers and two views or more: bodies.csv with rigid bodies and the '
+        'coordinates of their markers, instead of clusters; without the file markers, the shapes '
+        'give the ids',
     )
     principal_distance: float = option(
         0.0,
@@ -118,7 +118,7 @@ class ExtractionParameters(ManagedParameters):
     )
     queue_size: int = option(
         32,
-        'images of a fluoroscope that may wait; of more, the oldest exposure is shed; 1 for the '
+        'images of a fluoroscope that may wait; beyond that, the oldest exposure is shed; 1: '
         'least delay',
         minimum=1,
         maximum=10000,

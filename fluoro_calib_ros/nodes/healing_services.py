@@ -164,7 +164,9 @@ class Healing(Job):
         """Collect frames, diagnose what has changed, and keep the outcome."""
         seconds = goal.request.seconds or self._rig.settings().node.heal_time
         if not 0 < seconds <= MAX_SECONDS:
-            raise DataError(f'seconds is above 0 and at most {MAX_SECONDS:g}, not {seconds:g}')
+            raise DataError(
+                f'seconds must be above 0 and at most {MAX_SECONDS:g}, not {seconds:g}'
+            )
         rig = self._present_rig()
         self._healed = None
 

@@ -103,7 +103,7 @@ def test_times_that_a_node_cannot_wait_are_refused():
     check_timeout(1e-3)
     check_timeout(MAX_TIMEOUT_S)
     for wrong in (0.0, -1.0, float('nan'), 1.001 * MAX_TIMEOUT_S, float('inf')):
-        with pytest.raises(ValueError, match='timeout_sec is a time in seconds'):
+        with pytest.raises(ValueError, match='timeout_sec must be a time in seconds'):
             check_timeout(wrong)
 
 

@@ -171,10 +171,10 @@ def test_second_request_is_refused_while_one_runs(rig):
         ),
         ({'interior': 'free'}, "interior is one of estimated, fixed, not 'free'"),
         ({'loss': 'cauchy'}, "loss is one of student_t, huber, gaussian, not 'cauchy'"),
-        ({'principal_distance': -1.0}, 'principal_distance is a length in pixels, not -1.0'),
+        ({'principal_distance': -1.0}, 'principal_distance must be a length in pixels, not -1.0'),
         (
             {'principal_distance': float('nan')},
-            'principal_distance is a length in pixels, not nan',
+            'principal_distance must be a length in pixels, not nan',
         ),
     ],
 )

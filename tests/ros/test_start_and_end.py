@@ -305,7 +305,7 @@ def test_impossible_requests_are_answered(graph, tmp_path):
         answer = client.call(Capture, 'capture', timeout_sec=seconds)
         assert (
             not answer.success
-            and 'timeout_sec is a time in seconds, at most 86400, not' in answer.message
+            and 'timeout_sec must be a time in seconds, at most 86400, not' in answer.message
         )
         assert not client.call(Orient, 'orient', timeout_sec=seconds).success
     for kind, service in (

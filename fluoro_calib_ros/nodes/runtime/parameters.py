@@ -287,7 +287,9 @@ def _check_given(declaration: Option, given: Parameter) -> None:
     empty = given.type_ == Parameter.Type.NOT_SET or given.value == []  # of any type
     if not empty and given.type_ != Parameter.Type.from_parameter_value(listed):
         value = printable(shortened(repr(given.value)))
-        raise StartError(f'parameter {declaration.name} is {_WORDS[type(default)]}, not {value}')
+        raise StartError(
+            f'parameter {declaration.name} must be {_WORDS[type(default)]}, not {value}'
+        )
     try:
         declaration.validate(_tuple_or_value(declaration, given.value))
     except ValueError as error:
@@ -388,7 +390,7 @@ def check_timeout(seconds: float) -> None:
     """Raise ValueError for a time that a node cannot wait."""
     if not 0 < seconds <= MAX_TIMEOUT_S:
         limit = f', at most {MAX_TIMEOUT_S:g}' if seconds > MAX_TIMEOUT_S else ''
-        raise ValueError(f'timeout_sec is a time in seconds{limit}, not {seconds}')
+        raise ValueError(f'timeout_sec must be a time in seconds{limit}, not {seconds}')
 
 
 def expand_path(text: str) -> Path:

@@ -738,7 +738,7 @@ SENTENCES = {
     ),
     Kind.NOISE_OBSERVED: (
         'the image points have no sigma, and their rays show a noise of # px where the '
-        'calibration has # px; that of the rays is taken: give their sigma, if it is known'
+        'calibration has # px; the noise of the rays is used: give their sigma, if it is known'
     ),
     Kind.PAIRS_CONTRADICT: (
         'orientation of the rig: the exposures contradict each other: the relative orientation '

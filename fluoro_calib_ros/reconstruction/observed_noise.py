@@ -94,8 +94,8 @@ def _finding(factor: float, calibrations: Sequence[FluoroscopeCalibration]) -> F
     stated = float(np.mean([calibration.image_sd for calibration in calibrations]))
     return Finding(
         Kind.NOISE_OBSERVED,
-        f'the image points have no sigma, and their rays show a noise of {factor * stated:.2g} px '
-        f'where the calibration has {stated:.2g} px; that of the rays is taken',
+        f'the image points have no sigma, and their rays show a noise of {factor * stated:.2g} '
+        f'px where the calibration has {stated:.2g} px; the noise of the rays is used',
         advice='give their sigma, if it is known',
         severity=Severity.NOTE,
         numbers={'noise_px': factor * stated, 'calibration_px': stated},

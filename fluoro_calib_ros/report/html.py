@@ -43,7 +43,7 @@ TEMPLATES = Path(__file__).parent / 'templates'
 VERDICTS = {
     'pass': 'This calibration can be used.',
     'fail': 'Do not use this calibration.',
-    'cannot tell': 'It cannot be told whether this calibration can be used.',
+    'cannot tell': 'The checks cannot decide whether this calibration can be used.',
     None: 'This calibration has not been validated.',
 }
 MAX_ROWS = 40  # maximum rows in the lists of outliers and correlations
@@ -132,7 +132,7 @@ def _verdict(given: ReportInput) -> dict[str, Any]:
     verdict = None if given.validation is None else given.validation.get('verdict')
     findings = sentences(filter(None, [given.edited]))
     findings += given.validation.get('findings', []) if given.validation else []
-    findings += [f'This cannot be right: {doubt}' for doubt in given.result.get('doubts', [])]
+    findings += [f'Implausible: {doubt}' for doubt in given.result.get('doubts', [])]
     findings += sentences(filter(None, [given.rig_note]))
     if verdict is None:
         findings.insert(

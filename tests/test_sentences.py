@@ -644,7 +644,7 @@ SENTENCES = {
     ),
     Kind.UNTILTED_TARGETS: (
         'fluoroscope a: the targets are flat and not tilted: the principal distance is '
-        'undetermined: tilt the target by # degrees and more, or give the principal distance'
+        'undetermined: tilt the target by # degrees or more, or give the principal distance'
     ),
     Kind.DUPLICATE_NAME: (
         'fluoroscopes a and A differ only in case: use one name for one fluoroscope, or rename '
@@ -748,8 +748,8 @@ SENTENCES = {
         'them'
     ),
     Kind.PAIRS_EXCLUDED: (
-        'orientation of the rig: not from exposure #, in which fluoroscopes a and b stand '
-        'otherwise to each other by # px: the frames are from different exposures, or the '
+        'orientation of the rig: without exposure #, where the relative orientation of '
+        'fluoroscopes a and b differs by # px: the frames are from different exposures, or the '
         'phantom moved between them'
     ),
     Kind.RAYS_DO_NOT_MEET: (
@@ -777,9 +777,9 @@ SENTENCES = {
         'capture'
     ),
     Kind.TAKEN_ON_TRUST: (
-        'the orientation of fluoroscopes a and b takes on trust that frames of one number are of '
-        'one exposure, or that the phantom stands still (they have no stamps): a delay that is '
-        'always the same looks like another orientation where the phantom turns steadily'
+        'the orientation of fluoroscopes a and b assumes that frames with the same number are '
+        'simultaneous, or that the phantom stands still (they have no stamps): if the phantom '
+        'turns steadily, a constant delay looks like another orientation'
     ),
     Kind.POSE_AMBIGUOUS: (
         'the pose is ambiguous: the phantom fits nearly as well in another one (# beads '
@@ -828,12 +828,13 @@ SENTENCES = {
     ),
     Kind.CLUSTER_CHANGE: (
         'WARN: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper left '
-        'quarter, about (#, #) px, for # s, relative to the start; seen in cluster bone, where a '
-        'bead may have moved, since no other cluster shows the drift'
+        'quarter, about (#, #) px, for # s, relative to the start; detected in cluster bone, '
+        'where a bead may have moved, since no other cluster shows the drift'
     ),
     Kind.IMAGE_DRIFT: (
         'ERROR: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper left '
-        'quarter, about (#, #) px, for # s, relative to the start; seen in the epipolar residuals'
+        'quarter, about (#, #) px, for # s, relative to the start; detected in the epipolar '
+        'residuals'
     ),
     Kind.LEARNING: 'the reference is being learned',
     Kind.NO_DRIFT: 'no drift detected',

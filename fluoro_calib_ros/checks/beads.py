@@ -384,8 +384,8 @@ def compare_with_survey(
     named = beads.target_id[[worst]]
     numbers: dict[str, float] = {'beads': count}
     cause = (
-        f'bead {beads.target_id[worst]} lies {size[worst]:.2f} mm from its survey, the worst of '
-        f'{count}'
+        f'bead {beads.target_id[worst]} lies {size[worst]:.2f} mm from its survey, the largest '
+        f'deviation of {count}'
     )
     value = size[worst]
     highest = value * np.sqrt(limit / max(square[worst], 1e-9))

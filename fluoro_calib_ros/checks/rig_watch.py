@@ -336,7 +336,7 @@ class RecordingDriftWatch(RigDriftWatch):
             finding = Finding(
                 Kind.SHORT_RECORDING,
                 f'the recording is too short to detect a drift: it has {length_s:.1f} s, of '
-                f'which the first {learn_s:g} s are learned',
+                f'which the first {learn_s:g} s are the reference',
                 severity=WARN,
                 numbers={'length_s': length_s, 'learn_s': learn_s},
             )

@@ -94,8 +94,8 @@ def _new_id(block: Block, index: int, row: Mapping[str, str], names: Names) -> i
     if not row['target_id']:
         block.fail(
             index,
-            f'decision is {text!r}, but a whole exposure can only be left out: {LEAVE_OUT!r}; for '
-            'another id, name the target_id',
+            f'decision is {text!r}, but a whole exposure can only be excluded ({LEAVE_OUT!r}); '
+            'to change an id, name the target_id',
         )
     if text not in names.targets and not text.isdecimal():
         block.fail(index, f'decision is {text!r}, neither {LEAVE_OUT!r} nor a target_id')

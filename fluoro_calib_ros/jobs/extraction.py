@@ -221,8 +221,9 @@ def bent_shadows(fluoroscope: str, results: Sequence[ImageResult]) -> Finding | 
         return None
     return Finding(
         Kind.SHADOWS_BENT,
-        f'the distortion within the large shadows shifts their centres by {bent_px:.3f} px (RMS); '
-        f'some {remaining_px:.3f} px of it may be left in the correction, beyond what that claims',
+        f'the distortion within the large shadows shifts their centres by {bent_px:.3f} px '
+        f'(RMS); some {remaining_px:.3f} px of it may remain in the correction, in addition to '
+        'its standard deviation',
         Place((fluoroscope,)),
         advice='smaller beads reduce it, with the square of their size',
         severity=Severity.WARNING,

@@ -454,8 +454,8 @@ def common_motion(distance_mm: float) -> Finding:
     """Return a finding on the possible common motion of all points [mm]."""
     return Finding(
         Kind.COMMON_MOTION,
-        f'all points together may have moved by {distance_mm:.2f} mm (RMS) in the rig frame, '
-        'which no body shows',
+        f'a common motion of all points by {distance_mm:.2f} mm (RMS) in the rig frame may be '
+        'undetected',
         severity=Severity.NOTE,
         numbers={'distance_mm': distance_mm},
     )

@@ -347,5 +347,5 @@ class RecordingDriftWatch(RigDriftWatch):
         found_s = (self._found_ns - (self._first_ns or 0)) / 1e9
         ended = '; no longer detected at the end' if self.state.level == OK else ''
         statement = 'no longer holds' if worst.level == ERROR else 'may no longer hold'
-        cause = f'{worst.finding.cause}; detected {found_s:.1f} s after the start{ended}'
+        cause = f'{worst.finding.cause}; alarm {found_s:.1f} s after the start{ended}'
         return replace(worst.finding, cause=cause, advice=f'the calibration {statement}')

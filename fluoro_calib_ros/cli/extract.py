@@ -362,7 +362,7 @@ def _doubt_texts(spans: list[DoubtfulSpan], request: MarkerRequest) -> list[str]
     for span in spans:
         name = request.target_names.get(span.target_id, str(span.target_id))
         candidates = ' or '.join(request.target_names.get(i, str(i)) for i in span.others)
-        doubt = f'may be {candidates}' if candidates else 'may be something else'
+        doubt = f'may be {candidates}' if candidates else 'may be another object'
         texts.append(
             f'fluoroscope {span.fluoroscope}: marker {name} {doubt} in exposures {span.first} to '
             f'{span.last}: {span.reason}'

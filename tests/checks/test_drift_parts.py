@@ -711,7 +711,7 @@ def test_verdict_on_a_recording_is_that_of_its_worst_state(monkeypatch):
     assert found.found_ns == 102 * 10**9  # time at which the level was first reached
     assert found.began_ns == 103 * 10**9 - 3 * 10**9
     assert found.widening is wide[1] and found.watched_s == 20.0
-    assert 'found 2.0 s after the beginning; no longer detected at the end' in found.finding.cause
+    assert 'alarm 2.0 s after the start; no longer detected at the end' in found.finding.cause
     assert found.finding.advice == 'the calibration no longer holds'
     found = recorded([calm, warn], monkeypatch=monkeypatch)
     assert found.level == 'warn' and found.found_ns == 101 * 10**9

@@ -404,7 +404,7 @@ def test_file_round_trip_is_exact(tmp_path, found):
 @pytest.mark.parametrize(
     'change, sentence',
     [
-        ({'format_version': np.array(7)}, 'layout version 7, this program knows version 1'),
+        ({'format_version': np.array(7)}, 'layout version 7, this program reads version 1'),
         (
             {'format_version': None},
             'this is not a rig orientation file, it has no array format_version',

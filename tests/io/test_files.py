@@ -552,7 +552,7 @@ class Bomb:
 @pytest.mark.parametrize(
     'arrays, sentence',
     [
-        ({'format_version': np.array(7)}, 'layout version 7, this program knows versions 1 to 4'),
+        ({'format_version': np.array(7)}, 'layout version 7, this program reads versions 1 to 4'),
         ({'noise_profile': np.array([1.0, 1e3, 1.0])}, 'factors that no image has'),
         ({'noise_profile': np.array([1.0, 2.0])}, 'its noise profile has 2 values'),
         ({'format_version': np.array('1')}, 'format_version is not a whole number'),

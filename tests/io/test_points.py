@@ -434,7 +434,9 @@ def test_hdf5_of_something_else_is_refused(tmp_path, others, cause):
 
 def test_points_of_sleap_off_the_image_are_named(tmp_path):
     path = sleap_file(tmp_path / 'a.h5', ('track', 'xy', 'node', 'frame'))
-    with pytest.raises(DataError, match=r'frame 2: the point .* is off the image of 35 x 42 px'):
+    with pytest.raises(
+        DataError, match=r'frame 2: the point .* is outside the image of 35 x 42 px'
+    ):
         registry.read(path, FileSettings(image_size=(35, 42)))
 
 

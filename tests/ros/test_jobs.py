@@ -163,7 +163,7 @@ def test_second_request_is_refused_while_one_runs(rig):
 @pytest.mark.parametrize(
     'request_fields, message',
     [
-        ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, there are a, b'),
+        ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, expected one of a, b'),
         (
             {'model': 'spline'},
             'model is one of auto, none, knn, local_linear, parametric, hybrid, collocation, '

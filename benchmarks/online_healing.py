@@ -219,7 +219,7 @@ def _heal(listener: Listener) -> list[tuple[str, int]]:
         lambda: any(text.startswith(learned) for text in listener.statuses.values()),
         'shapes to be learned',
     )
-    events = [('shapes are the reference', listener.newest)]
+    events = [('shapes are learned', listener.newest)]
     bump = round(HEALTHY_S * RATE_HZ)
     listener.wait(lambda: listener.newest > bump, 'the bump')
     events.append(('the bump', bump))

@@ -71,9 +71,9 @@ class Option:
 
     def _range(self) -> str:
         if self.minimum is None:
-            return f'{self.maximum:g} at most'
+            return f'at most {self.maximum:g}'
         if self.maximum is None:
-            return f'{self.minimum:g} at least'
+            return f'at least {self.minimum:g}'
         return f'between {self.minimum:g} and {self.maximum:g}'
 
 

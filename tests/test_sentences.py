@@ -321,7 +321,7 @@ def no_orientation():
 def saved_note():
     with mock.patch.multiple(
         result_folder,
-        read_result=lambda _: {'rig_note': 'orientation of the rig: not from exposure 5'},
+        read_result=lambda _: {'rig_note': 'orientation of the rig: without exposure 5'},
         saved_orientation=lambda _: None,
     ):
         return result_folder.saved_rig_note('result')
@@ -636,7 +636,7 @@ SENTENCES = {
     ),
     Kind.UNDETERMINED: (
         'the exposures do not determine the unknowns: the orientation of exposure # of a is '
-        'left open; add exposures with the phantom turned and moved, with more targets'
+        'undetermined; add exposures with the phantom turned and moved, with more targets'
     ),
     Kind.WEAK_INTERSECTION: (
         '# beads are not surveyed, their rays meet at less than # degrees: #, #, #, #, # and # '
@@ -767,7 +767,7 @@ SENTENCES = {
         'and # degrees (distance of the sources # times): one of them was moved since, the '
         'frames are from different exposures, or this is another phantom'
     ),
-    Kind.RIG_NOTE: 'orientation of the rig: not from exposure #',
+    Kind.RIG_NOTE: 'orientation of the rig: without exposure #',
     Kind.RIG_NOT_ORIENTED: (
         'no orientation of the rig: fluoroscopes a and b: no exposures have the same number'
     ),

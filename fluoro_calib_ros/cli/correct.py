@@ -107,7 +107,7 @@ def run(arguments: argparse.Namespace) -> None:
     else:
         suffixes = listed(('.csv', *READ_SUFFIXES))
         raise DataError(
-            f'{arguments.source}: files with the ending {suffix_of(arguments.source)} cannot be '
+            f'{arguments.source}: files with the suffix {suffix_of(arguments.source)} cannot be '
             f'read, only {suffixes} and folders of images'
         )
 

@@ -148,7 +148,9 @@ class MeasuredDistance:
         if self.first == self.second:
             raise DataError('both ends are the same bead', place=place)
         if not (0 < self.length_mm < np.inf and 0 < self.sd_mm < np.inf):
-            raise DataError('length and standard deviation must be above 0', place=place)
+            raise DataError(
+                'length and standard deviation must be finite and above 0', place=place
+            )
 
     @property
     def name(self) -> str:

@@ -493,7 +493,7 @@ def test_healed_rig_is_told_by_fluoroscope_with_what_it_is_worth():
     [
         ((), False, 'no change of the rig is evident'),
         ((Cause.LOOSE,), False, 'no change of the rig is evident'),
-        ((Cause.LOOSE, Cause.DISTORTION), False, 'it stays'),
+        ((Cause.LOOSE, Cause.DISTORTION), False, 'the calibration stays'),
         ((), True, 'the rig changed during the recording'),
     ],
 )

@@ -315,7 +315,7 @@ def test_names_of_classes_are_refused_from_files_and_messages(tmp_path):
 
 @pytest.mark.parametrize('model', [DecisionTreeRegressor, 5, None, {}])
 def test_model_that_is_no_regressor_is_refused(model):
-    with pytest.raises(ValueError, match='model is a name or a scikit-learn regressor'):
+    with pytest.raises(ValueError, match='model must be a name or a scikit-learn regressor'):
         CalibrationOptions(model)
 
 
@@ -328,7 +328,7 @@ def test_options_with_a_regressor_exclude_k():
 
 def test_lookup_cannot_be_selected():
     assert 'lookup' in MODELS
-    with pytest.raises(ValueError, match='model is one of'):
+    with pytest.raises(ValueError, match='model must be one of'):
         CalibrationOptions('lookup')
 
 

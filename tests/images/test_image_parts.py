@@ -525,7 +525,7 @@ def test_a_turned_view_sees_the_moved_phantom_as_the_first_one_sees_the_phantom(
 
 
 def test_regular_phantoms_are_flat_grids():
-    with pytest.raises(DataError, match='no flat grid'):
+    with pytest.raises(DataError, match='not a flat grid'):
         PhantomModel.of(beads(), regular=True)
 
 

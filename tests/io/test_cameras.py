@@ -336,7 +336,7 @@ def test_unit_is_never_silent(tmp_path):
     written = registry.write(tmp_path, 'mayacam2', Content(cameras=cameras()), FileSettings())
     assert 'lengths in mm' in written.notes[0]
     with pytest.raises(
-        DataError, match=r'does not say the unit of its lengths, --units mm\|cm\|m'
+        DataError, match=r'does not state the unit of its lengths, --units mm\|cm\|m'
     ):
         registry.read(tmp_path, FileSettings())
 

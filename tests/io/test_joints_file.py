@@ -118,7 +118,7 @@ def test_faults_are_named(tmp_path, change, cause):
 
 def test_a_file_beyond_the_budget_of_documents_is_not_parsed(tmp_path):
     path = written(tmp_path, KNEE + '#' * DOCUMENT_BYTES['TOML'])
-    with pytest.raises(DataError, match=r'the TOML text has .* MB are not read'):
+    with pytest.raises(DataError, match=r'the TOML text has .* MB; the limit is .* MB'):
         read_joints(path, BODIES)
 
 
@@ -142,7 +142,7 @@ def test_a_file_beyond_the_budget_of_documents_is_not_parsed(tmp_path):
             ),
             'isb_ankle has no landmarks',
         ),
-        ('[[joint]]\n' * (MAX_JOINTS + 1), f'more than {MAX_JOINTS}'),
+        ('[[joint]]\n' * (MAX_JOINTS + 1), f'the limit is {MAX_JOINTS}'),
     ],
 )
 def test_wrong_files_are_refused(tmp_path, text, cause):

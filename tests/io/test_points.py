@@ -339,7 +339,7 @@ def test_no_code_of_a_file_of_deeplabcut_is_run(tmp_path):
         (lambda p: pandas_table(p, PREDICTED, b'(lp0\n'), 'pickle exhausted before'),
         (
             lambda p: pandas_table(p, PREDICTED, stored(['x'] * 6)),
-            'its columns ha',
+            'its columns ',
         ),
         (lambda p: pandas_table(p, PREDICTED, stored([('x', 'y')] * 6)), '2 head'),
         (lambda p: pandas_fixed(p, LABELLED, nblocks=2), 'its columns are not of one kind'),
@@ -827,7 +827,7 @@ def test_xmalab_3d_points_of_a_lab_are_read(tmp_path):
     found = registry.read(path, FileSettings(units='cm')).points
     assert found.frame.tolist() == [1, 2]
     assert found.xyz_mm[1, 1].tolist() == [70, 80, 90] and np.isnan(found.xyz_mm[0, 1]).all()
-    assert 'does not say the unit' in refused(path, FileSettings())
+    assert 'does not state the unit' in refused(path, FileSettings())
 
 
 # ---- rigid bodies

@@ -71,7 +71,7 @@ def test_an_exchanged_calibration_is_named(folder, capsys):
     exchange(folder)
     sentence = (
         f'{folder}: the calibration file of a and result.json belong to different calibrations: '
-        'one of them was exchanged'
+        'one of them was replaced'
     )
     assert correct(folder) == 0
     assert capsys.readouterr().err.startswith(sentence)

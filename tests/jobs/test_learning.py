@@ -139,7 +139,7 @@ def test_nothing_is_learned_in_a_drift_or_with_a_healed_rig(healthy):
     with refused(Kind.RAYS_DO_NOT_MEET):
         healthy.learn(shifted)
     healed = replace(healthy.orientation, source='healing')
-    with pytest.raises(DataError, match='is a healed rig, from which no shapes are the reference'):
+    with pytest.raises(DataError, match='is a healed rig, from which no shapes are learned'):
         healthy.learn(orientation=healed)
 
 

@@ -233,7 +233,10 @@ def test_results_keep_the_order_of_their_tasks_and_few_tasks_are_in_memory():
 
 
 def test_a_worker_that_dies_is_told():
-    with LocalWorkers(2) as workers, pytest.raises(DataError, match='worker process was ended'):
+    with (
+        LocalWorkers(2) as workers,
+        pytest.raises(DataError, match='worker process was terminated'),
+    ):
         list(workers.map(os._exit, [1, 1]))
 
 

@@ -534,9 +534,9 @@ def test_phantom_is_sorted_and_looked_up_by_id():
         ({'target_id': [1, 2, 3]}, '3 target ids, but coordinates of shape'),
         (
             {'xyz_mm': np.where(np.arange(12).reshape(4, 3) == 7, np.nan, 1.0)},
-            'target 3 has a wrong coordinate',
+            'target 3 has an invalid coordinate',
         ),
-        ({'sd_mm': [0.1, 0.0, 0.1, 0.1]}, 'target 2 has a wrong sd'),
+        ({'sd_mm': [0.1, 0.0, 0.1, 0.1]}, 'target 2 has an invalid sd'),
         (
             {'target_id': [1, 2, 3], 'xyz_mm': np.zeros((3, 3)), 'sd_mm': np.ones(3)},
             '3 targets are too few',

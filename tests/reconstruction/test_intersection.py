@@ -469,7 +469,7 @@ def test_empty_frame_and_wrong_shapes():
         ({'optical_frame_ids': ('a',)}, '2 fluoroscopes, but 1 optical frames'),
         (
             {'source': 'guess'},
-            "its source is one of capture, joint calibration, healing, not 'guess'",
+            "its source must be one of capture, joint calibration, healing, not 'guess'",
         ),
         ({'frame_id': ''}, 'the rig frame has no name'),
         ({'position_mm': np.zeros(3)}, r'position_mm has shape \(3,\), not \(2, 3\)'),

@@ -420,7 +420,7 @@ def test_reconstruct_reports_where_no_drift_can_be_detected(folder, capsys):
         (
             'short.csv',
             ['--cluster', 'tibia: 1 2'],
-            'which is no bag, does not contain the times of its exposures',
+            'short.csv is not a bag',
         ),
     ],
 )

@@ -166,11 +166,11 @@ def test_second_request_is_refused_while_one_runs(rig):
         ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, expected one of a, b'),
         (
             {'model': 'spline'},
-            'model is one of auto, none, knn, local_linear, parametric, hybrid, collocation, '
+            'model must be one of auto, none, knn, local_linear, parametric, hybrid, collocation, '
             "not 'spline'",
         ),
-        ({'interior': 'free'}, "interior is one of estimated, fixed, not 'free'"),
-        ({'loss': 'cauchy'}, "loss is one of student_t, huber, gaussian, not 'cauchy'"),
+        ({'interior': 'free'}, "interior must be one of estimated, fixed, not 'free'"),
+        ({'loss': 'cauchy'}, "loss must be one of student_t, huber, gaussian, not 'cauchy'"),
         ({'principal_distance': -1.0}, 'principal_distance must be a length in pixels, not -1.0'),
         (
             {'principal_distance': float('nan')},

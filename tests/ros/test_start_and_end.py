@@ -90,13 +90,17 @@ PHANTOM = {'phantom': BAGS / 'phantom.csv'}
         (
             'calibration_node',
             {'phantom': BAGS / 'phantom.csv', 'model': 'spline'},
-            'model is one of',
+            'model must be one of',
         ),
-        ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'pair_by': 'luck'}, 'pair_by is'),
+        (
+            'calibration_node',
+            {'phantom': BAGS / 'phantom.csv', 'pair_by': 'luck'},
+            'pair_by must be',
+        ),
         (
             'calibration_node',
             {'phantom': BAGS / 'phantom.csv', 'still_px': -1.0},
-            'parameter still_px is between',
+            'parameter still_px must be between',
         ),
         (
             'calibration_node',

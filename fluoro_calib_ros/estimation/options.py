@@ -265,7 +265,7 @@ class CalibrationOptions:
     loss: str = option('student_t', 'noise model of the image points', choices=LOSSES)
     k: int | None = option(
         None,
-        'neighbours of knn, local_linear or hybrid; chosen by default',
+        'neighbours of knn, local_linear or hybrid; automatic by default',
         minimum=1,
         maximum=MAX_NEIGHBOURS,
     )

@@ -618,9 +618,7 @@ SENTENCES = {
         'surveyed coordinates: #, #, #, #, # and # more'
     ),
     Kind.FEW_TARGETS: 'fluoroscope a, exposure #: # targets are too few, # are needed',
-    Kind.NOT_ORIENTED: (
-        'fluoroscope a, exposure #: all image points lie on one line or in one place'
-    ),
+    Kind.NOT_ORIENTED: ('fluoroscope a, exposure #: all image points are collinear or coincide'),
     Kind.POOR_FIT: (
         'fluoroscope a, exposure #: the image points do not fit the phantom, their residuals '
         'are about # px'
@@ -670,7 +668,7 @@ SENTENCES = {
     ),
     Kind.MIXED_UNITS: (
         'phantom: # targets, #, #, #, #, # and # more, are in a different unit from the others: '
-        'they fit when their coordinates are multiplied by # (cm in place of mm)'
+        'they fit when their coordinates are multiplied by # (cm instead of mm)'
     ),
     Kind.OTHER_PHANTOM: (
         'fluoroscope a: the image points do not fit the phantom: this is another phantom, or '

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--neutral',
         type=Path,
         metavar='RECORDING',
-        help='another recording with all joints in neutral position, in place of the exposures '
+        help='another recording with all joints in neutral position, instead of the exposures '
         'that the joints file names',
     )
     add_out(parser, 'folder to write')

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='SOURCE',
         help='grey images (png, tif, jpg, bmp, pgm), folders of images, TIFF stacks, videos '
         '(avi, mkv, mp4, cine), DICOM files, bags with images; an exposure has the number in the '
-        'name of its file, else its place in the order',
+        'name of its file, else its position in the order',
     )
     add_phantom(
         parser,

@@ -155,8 +155,8 @@ def run(arguments: argparse.Namespace) -> None:
         'blocked': drawing.blocked_id.tolist(),
     }
     text = (
-        f'{count} targets, {len(drawing.blocked_id)} places are blocked\nwritten to '
+        f'{count} targets, {len(drawing.blocked_id)} positions are blocked\nwritten to '
         f'{arguments.out}; compare {picture} with the part: ids from the upper left, blocked '
-        'places crossed out'
+        'positions crossed out'
     )
     print_result(arguments, document, text)

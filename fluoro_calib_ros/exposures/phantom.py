@@ -178,7 +178,7 @@ class Drawing:
                 1 <= row <= self.rows and 1 <= column <= self.columns and 1 <= layer <= self.layers
             ):
                 raise DataError(
-                    f'the blocked place {",".join(map(str, place))} is not on the drawing of '
+                    f'the blocked position {",".join(map(str, place))} is outside the drawing of '
                     f'{self.rows} rows, {self.columns} columns and {self.layers} layers'
                 )
             ids.append(((layer - 1) * self.rows + row - 1) * self.columns + column)

@@ -101,7 +101,7 @@ def identify_markers(
     names = list(orientation.fluoroscopes)
     bodies = identifiable(bodies)
     if not bodies:
-        raise DataError(f'there is no body with {MIN_MEMBERS} markers of known places')
+        raise DataError(f'there is no body with {MIN_MEMBERS} markers with known coordinates')
     rig = CalibratedRig(orientation, calibrations, angles or {})
     for name in names:
         check_image(images[name], calibrations[name].image_size)

@@ -100,10 +100,10 @@ class FirstMarkers:
         if not len(ids):
             raise DataError('the first frame has no markers')
         if uv.shape != (len(ids), 2):
-            raise DataError(f'{len(ids)} markers, but places of shape {uv.shape}')
+            raise DataError(f'{len(ids)} markers, but image points of shape {uv.shape}')
         if not np.isfinite(uv).all():
             unplaced_id = ids[~np.isfinite(uv).all(axis=1)][0]
-            raise DataError(f'marker {unplaced_id} of the first frame has no place')
+            raise DataError(f'marker {unplaced_id} of the first frame has no image point')
         unique, count = np.unique(ids, return_counts=True)
         if (count > 1).any():
             raise DataError(f'marker {unique[count > 1][0]} occurs twice in the first frame')

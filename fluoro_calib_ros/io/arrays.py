@@ -156,7 +156,7 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
     version = _read_member(path, archive, 'format_version')
     if version.shape != () or version.dtype.kind not in 'iu':
         raise DataError(
-            f'{path}: this is not {layout.content} file, its format_version is not a whole number'
+            f'{path}: this is not {layout.content} file, its format_version is not an integer'
         )
     if not 1 <= version <= layout.version:
         last = layout.version

@@ -110,5 +110,5 @@ def _number(
     if text in known:
         return known[text]
     if not text.isdecimal() or int(text[:11]) > MAX_ID:
-        block.fail(index, f'{column} is {text!r}, not a whole number from 0 to {MAX_ID}')
+        block.fail(index, f'{column} is {text!r}, not an integer from 0 to {MAX_ID}')
     return int(text)

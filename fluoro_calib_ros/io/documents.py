@@ -190,7 +190,7 @@ def _check_whole(value: Any) -> None:
 def _whole(value: str | int) -> int:
     # 64-bit integers have up to 19 digits; converting many more takes quadratic time.
     if (isinstance(value, str) and len(value) > 19) or abs(int(value)) > 2**63:
-        raise ValueError('a whole number is too large')
+        raise ValueError('an integer is too large')
     return int(value)
 
 

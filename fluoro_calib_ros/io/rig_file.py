@@ -297,7 +297,7 @@ def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
             if first.path != trial.path:
                 raise DataError(
                     f'{path}, key trials: {first.path} and {trial.path} would have the same '
-                    f'results; name one of them, or move it to a folder of its own'
+                    'results; name one of them, or move it to a separate folder'
                 )
     return tuple(trials.values())
 

@@ -261,7 +261,7 @@ class MarkerFollower:
         self._renew()
         if not settings.first and not identifiable(settings.bodies):
             raise DataError(
-                'there are neither given markers nor a body of four markers of known places'
+                'there are neither given markers nor a body of four markers with known coordinates'
             )
 
     def _renew(self) -> None:

@@ -64,7 +64,7 @@ def plane_of(xyz: NDArray[np.float64]) -> Plane:
     centre = xyz.mean(axis=0)
     _, extent, axes = np.linalg.svd(xyz - centre, full_matrices=False)
     if extent[1] <= MIN_FLATNESS * extent[0]:
-        raise DataError('all targets lie on one line or in one place')
+        raise DataError('all targets are collinear or coincide')
     axes = axes * np.array([1, 1, np.linalg.det(axes)])[:, None]
     return Plane(centre, axes)
 
@@ -108,7 +108,7 @@ def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArr
         raise DataError(f'{len(xy)} targets are too few for a resection, {MIN_TARGETS} are needed')
     spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_FLATNESS * spread[0]:
-        raise DataError('all image points lie on one line or in one place')
+        raise DataError('all image points are collinear or coincide')
     rng = np.random.default_rng(0)
     samples = np.argsort(rng.random((SAMPLES, len(xy))), axis=1)[:, :SAMPLE_SIZE]
     candidates = homography(xy[samples], uv[samples])

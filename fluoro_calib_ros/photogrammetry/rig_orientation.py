@@ -125,8 +125,8 @@ class RigOrientation:
         count = len(names)
         if not names or len(set(names)) < count:
             raise DataError(
-                f'rig orientation: the fluoroscopes are {", ".join(names) or "none"}, '
-                'but each must have a name of its own'
+                f'rig orientation: the fluoroscopes are {", ".join(names) or "none"}, but each '
+                'needs a unique name'
             )
         for label, values in (('calibrations', ids), ('optical frames', frames)):
             if len(values) != count:

@@ -83,8 +83,8 @@ class EpipolarGeometry:
         size = np.max(np.linalg.norm(orientation.position_mm[rows], axis=1))
         if np.linalg.norm(position_a - position_b) <= MIN_BASE * size:
             raise DataError(
-                f'fluoroscopes {a} and {b} have their sources in one place, '
-                'so they have no epipolar geometry'
+                f'fluoroscopes {a} and {b} have coincident sources, so they have no epipolar '
+                'geometry'
             )
         self.fluoroscopes = (a, b)
         self._interior = orientation.interior[rows]

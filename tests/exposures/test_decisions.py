@@ -107,7 +107,7 @@ def test_table_is_read_with_names(tmp_path):
     [
         ('a,1,,2,maybe', "decision is 'maybe', neither 'leave out' nor a target_id"),
         ('a,1,,,3', "decision is '3', but a whole exposure can only be excluded"),
-        ('a,x,,2,3', "exposure is 'x', not a whole number"),
+        ('a,x,,2,3', "exposure is 'x', not an integer"),
         ('a,5,4,2,3', 'last_exposure is 4, before exposure 5'),
         ('a,1,,99999999999,3', 'target_id is'),
     ],

@@ -57,7 +57,7 @@ def test_rotation_matrix_of_giant_numbers(tmp_path):
 
 
 def test_phantom_in_one_place():
-    with pytest.raises(DataError, match='all targets lie in one place'):
+    with pytest.raises(DataError, match='all targets coincide'):
         robust_dlt(np.full((20, 3), 5e-324), np.random.default_rng(0).uniform(0, 1000, (20, 2)))
 
 

@@ -382,8 +382,11 @@ def test_what_cannot_be_followed_is_said():
     [
         (([], np.zeros((0, 2))), 'has no markers'),
         (([1, 1], np.ones((2, 2))), 'marker 1 occurs twice'),
-        (([1, 2], np.array([[5, 5], [np.nan, 5]])), 'marker 2 of the first frame has no place'),
-        (([1], np.ones((2, 2))), 'places of shape'),
+        (
+            ([1, 2], np.array([[5, 5], [np.nan, 5]])),
+            'marker 2 of the first frame has no image point',
+        ),
+        (([1], np.ones((2, 2))), 'image points of shape'),
     ],
 )
 def test_a_wrong_first_frame_is_refused(first, reason):

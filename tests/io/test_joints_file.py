@@ -86,7 +86,7 @@ def test_joints_are_read(tmp_path):
         (('[3, 40]', '[3.5, 40]'), 'key neutral'),
         (('side =', 'sides ='), 'key sides: unknown'),
         (('[0, 0, 400]', '[0, 0, nan]'), 'femoral_head has a number that is not finite'),
-        (('[0, 0, 400]', f'[0, 0, 1{"0" * 400}]'), 'a whole number is too large'),
+        (('[0, 0, 400]', f'[0, 0, 1{"0" * 400}]'), 'an integer is too large'),
         (('[0, 0, 400]', '[' * (MAX_DEPTH + 1) + ']' * (MAX_DEPTH + 1)), 'nested too deeply'),
         (('landmarks]', 'a.' * MAX_DEPTH + 'landmarks]'), 'nested too deeply'),
         (('[0, 0, 400]', '[0, 400]'), 'femoral_head does not have 3 numbers'),

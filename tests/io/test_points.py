@@ -520,7 +520,7 @@ def test_wrong_xmalab_points_name_the_row(tmp_path, text, sentence):
 def test_columns_mixing_ids_and_names_are_refused(tmp_path):
     path = tmp_path / 'points.csv'
     path.write_text('fluoroscope,exposure,target_id,u,v\na,1,3,5,5\na,1,bead4,6,6\n')
-    assert refused(path) == f"{path}, row 3: target_id is 'bead4', not a whole number"
+    assert refused(path) == f"{path}, row 3: target_id is 'bead4', not an integer"
 
 
 # ---- phantoms

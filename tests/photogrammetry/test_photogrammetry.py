@@ -244,10 +244,10 @@ def test_resection_is_robust_to_false_matches_and_distortion(seed):
     'spoil, message',
     [
         (lambda xyz: xyz[:7], '7 targets are too few for a resection, 8 are needed'),
-        (lambda xyz: xyz * (1, 1, 0), 'all targets lie in one plane'),
+        (lambda xyz: xyz * (1, 1, 0), 'all targets are coplanar'),
         (
             lambda xyz: xyz @ np.diag([1, 1, 1e-4]) @ matrix_from_vector([1.0, 2, 3]),
-            'all targets lie in one plane',
+            'all targets are coplanar',
         ),
     ],
 )

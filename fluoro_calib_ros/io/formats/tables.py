@@ -109,7 +109,7 @@ class Row:
         """Return a cell as a non-negative integer. Raises DataError."""
         cell = self.cells[column]
         if not cell.isascii() or not cell.isdigit():
-            self.fail(f'{what} is {quoted(cell)}, not a whole number')
+            self.fail(f'{what} is {quoted(cell)}, not an integer')
         return int(cell)
 
 

@@ -273,10 +273,10 @@ def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -
 # Name of a value in messages, by the type of the default.
 _WORDS = {
     bool: 'true or false',
-    int: 'a whole number',
+    int: 'an integer',
     float: 'a number',
     str: 'a text',
-    tuple: 'a list of texts, such as [a, b]',
+    tuple: 'a list of strings, such as [a, b]',
 }
 
 

@@ -155,7 +155,7 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
         if found is None:
             return None
         followed = _measured(
-            detections, seen, found=found, model=model, imaging=near.imaging, passes=(STEPS,)
+            detections, seen, matched=found, model=model, imaging=near.imaging, passes=(STEPS,)
         )
     except DataError:
         return None
@@ -174,16 +174,16 @@ def _seen(detections: Detections, model: PhantomModel) -> Seen:
 def _measured(
     detections: Detections,
     seen: Seen,
-    found: Match,
+    matched: Match,
     model: PhantomModel,
     imaging: Imaging | None = None,
     passes: tuple[int, ...] = (FIRST_STEPS, STEPS),
 ) -> Extraction:
     """Measure all predicted beads, by default twice: the second time from a better prediction."""
-    view = found.view
-    predicted = found.predicted
-    bead = found.bead
-    uv = seen.uv[found.detection]
+    view = matched.view
+    predicted = matched.predicted
+    bead = matched.bead
+    uv = seen.uv[matched.detection]
     light = detections.light
     for steps in passes:
         rows = np.flatnonzero(seen.in_field(predicted))
@@ -207,13 +207,13 @@ def _measured(
         reasons = _reasons(beads, predicted[rows])
         reasons = [reason if known else HIDDEN for reason, known in zip(reasons, sized)]
         good = np.array([reason is None for reason in reasons], dtype=bool)
-        if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(found.bead)):
+        if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(matched.bead)):
             measured_well = int(np.count_nonzero(good))
             raise DataError(
-                f'the phantom is found with {len(found.bead)} beads, of which only '
+                f'the phantom is found with {len(matched.bead)} beads, of which only '
                 f'{measured_well} can be measured',
                 kind=Kind.BEADS_NOT_MEASURED,
-                numbers={'beads': len(found.bead), 'measured': measured_well},
+                numbers={'beads': len(matched.bead), 'measured': measured_well},
             )
         bead = rows[good]
         uv = beads.uv[good]
@@ -229,7 +229,7 @@ def _measured(
         predicted = view.project(model.xyz) + nearby.value
         measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
     assert imaging is not None
-    extraction = _checked(detections, found, view, measured, imaging)
+    extraction = _checked(detections, matched, view, measured, imaging)
     extraction = _with_support(extraction, model, rows)
     # The fit measures the centres of shadows; observations are the projected centres of beads.
     radius_px = imaging.profile.border_px * (shadows.radius * size)
@@ -272,7 +272,7 @@ def _away(measured: _Measured) -> NDArray[np.bool_]:
 
 def _checked(
     detections: Detections,
-    found: Match,
+    matched: Match,
     view: View,
     measured: _Measured,
     imaging: Imaging,
@@ -306,7 +306,7 @@ def _checked(
         refused=refused,
         view=view,
         detections=detections,
-        match=found,
+        match=matched,
         imaging=imaging,
     )
 

@@ -203,7 +203,7 @@ class SurveyedBeads:
 
 
 def surveyed_beads(
-    result: CalibrationResult, given: Phantom, distances: Sequence[MeasuredDistance] = ()
+    result: CalibrationResult, initial: Phantom, distances: Sequence[MeasuredDistance] = ()
 ) -> SurveyedBeads:
     """Return the beads of a joint calibration with inner constraints, at a measured scale.
 
@@ -211,9 +211,9 @@ def surveyed_beads(
     """
     (solved,) = result.solved.values()
     targets = result.targets
-    row = given.index(targets.target_id)
-    given_mm = given.xyz_mm[row]
-    given_sd = given.sd_mm[row]
+    row = initial.index(targets.target_id)
+    given_mm = initial.xyz_mm[row]
+    given_sd = initial.sd_mm[row]
     network = solved.measured.network
     in_datum = slice(None) if network.in_datum is None else network.in_datum
     centre = targets.xyz_mm[in_datum].mean(axis=0)

@@ -150,7 +150,7 @@ def principal_distance_of_planes(
 
 
 def poses_of_homography(
-    found: NDArray[np.float64], plane: Plane, interior: NDArray[np.float64]
+    homography: NDArray[np.float64], plane: Plane, interior: NDArray[np.float64]
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Return rotation (3, 3) and position (3,) [mm] by a homography, and the mirrored pose.
 
@@ -158,7 +158,7 @@ def poses_of_homography(
     centre of the targets.
     """
     xp, yp, c = interior
-    m = np.linalg.solve(np.array([[c, 0, xp], [0, c, yp], [0, 0, 1.0]]), found)
+    m = np.linalg.solve(np.array([[c, 0, xp], [0, c, yp], [0, 0, 1.0]]), homography)
     m = m / np.sqrt(np.linalg.norm(m[:, 0]) * np.linalg.norm(m[:, 1]))
     if m[2, 2] < 0:  # the centre of the targets is in front of the source
         m = -m

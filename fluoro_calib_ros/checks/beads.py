@@ -170,7 +170,7 @@ class _Fit:
     def improvement(self, candidate: _Candidate) -> float:
         """Return the factor by which its own motion decreases the median square of a layer."""
         rows = candidate.own
-        motions = self._motion_and_rest(rows)
+        motions = self._motions_of_parts(rows)
         after, before = (
             np.median(
                 self._squares(self._beads.misclosure[rows] - self._design[rows] @ motion, rows)
@@ -190,7 +190,7 @@ class _Fit:
                 return None
             return float(coordinate[at - 1 : at + 1].mean())
 
-        motion, motion_of_others = self._motion_and_rest(rows)
+        motion, motion_of_others = self._motions_of_parts(rows)
         relative = motion - motion_of_others
         shifts = self._design[rows] @ relative
         size = float(np.sqrt(np.mean(np.sum(shifts**2, axis=1))))
@@ -206,18 +206,18 @@ class _Fit:
             limit_mm=size * float(np.sqrt(critical / candidate.gain)),
         )
 
-    def _motion_and_rest(
-        self, own: NDArray[np.int64]
+    def _motions_of_parts(
+        self, rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the motions (6,) of the given beads and of all other beads."""
-        equations = _Equations(self._normals[own].sum(axis=0), self._rights[own].sum(axis=0))
+        equations = _Equations(self._normals[rows].sum(axis=0), self._rights[rows].sum(axis=0))
         return equations.motion, self._all.without(equations).motion
 
     def _squares(
-        self, left: NDArray[np.float64], rows: NDArray[np.int64] | slice
+        self, misclosures: NDArray[np.float64], rows: NDArray[np.int64] | slice
     ) -> NDArray[np.float64]:
-        """Return the weighted squares (k,) of remaining misclosures left (k, 3) of beads."""
-        return np.einsum('na,nab,nb->n', left, self._information[rows], left)
+        """Return the weighted squares (k,) of remaining misclosures (k, 3) of beads."""
+        return np.einsum('na,nab,nb->n', misclosures, self._information[rows], misclosures)
 
 
 def _layers(coordinate: NDArray[np.float64], sd: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -285,19 +285,19 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
     return [check.after_trend(trends.is_significant) for check in (held_out, exposures)]
 
 
-def _rejected_exposure(name: str, found: RejectedExposure) -> Check:
+def _rejected_exposure(name: str, rejected: RejectedExposure) -> Check:
     """Return the check that fails because rejected image points of an exposure agree."""
     return Check(
         Kind.EXPOSURES,
-        f'{found.points} of {found.of} image points of exposure {found.number} are rejected as '
-        'false matches, but agree with their neighbours',
-        Place((name,), (found.number,), name=f'fluoroscope {name}'),
+        f'{rejected.points} of {rejected.of} image points of exposure {rejected.number} are '
+        'rejected as false matches, but agree with their neighbours',
+        Place((name,), (rejected.number,), name=f'fluoroscope {name}'),
         'the calibration does not hold in this exposure: inspect it (phantom, lens or '
         'fluoroscope moved, wrong ids), exclude it by a decision in doubtful.csv and calibrate '
         'again',
-        numbers={'rejected_points': found.points, 'points': found.of},
-        value=found.agreement,
-        limit=found.limit,
+        numbers={'rejected_points': rejected.points, 'points': rejected.of},
+        value=rejected.agreement,
+        limit=rejected.limit,
         unit='sd of chance',
     )
 

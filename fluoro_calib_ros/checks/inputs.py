@@ -153,7 +153,7 @@ def validate_names(names: Iterable[str]) -> None:
             )
 
 
-def why_excluded(frame: Frame, phantom: Phantom) -> Finding | None:
+def exclusion_reason(frame: Frame, phantom: Phantom) -> Finding | None:
     """Return why a misfitting exposure is excluded, or None if the cause is not found."""
     cause = _cause(frame, phantom)
     return None if cause is None or cause.kind is Kind.OTHER_PHANTOM else cause

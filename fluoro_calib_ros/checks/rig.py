@@ -333,12 +333,12 @@ def rig_findings(
     )
 
 
-def check_rig(found: RigFindings) -> list[Check]:
+def check_rig(findings: RigFindings) -> list[Check]:
     """Return a check for every fluoroscope of a rig except the first."""
-    if not found.fluoroscopes:
+    if not findings.fluoroscopes:
         return []
-    if not found.scatter:
-        (doubt,) = found.doubts
+    if not findings.scatter:
+        (doubt,) = findings.doubts
         contradicts = doubt.kind is Kind.PAIRS_CONTRADICT
         return [
             Check(
@@ -352,15 +352,15 @@ def check_rig(found: RigFindings) -> list[Check]:
                 unit='largest of a rig' if contradicts else '',
             )
         ]
-    return [_check(found, pairs) for pairs in found.scatter]
+    return [_check(findings, pairs) for pairs in findings.scatter]
 
 
-def _check(found: RigFindings, pairs: PairScatter) -> Check:
+def _check(findings: RigFindings, pairs: PairScatter) -> Check:
     """Return the check of the scatter of the pairs of two fluoroscopes."""
     a, b = pairs.fluoroscopes
     off_px = float(np.median(pairs.off_px[pairs.used]))
     predicted = off_px / max(pairs.unexplained, 1.0)
-    doubts = [doubt for doubt in found.doubts if doubt.place.fluoroscopes == (a, b)]
+    doubts = [doubt for doubt in findings.doubts if doubt.place.fluoroscopes == (a, b)]
     doubts = [doubt for doubt in doubts if doubt.kind in (Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED)]
     cause = (
         f'the relative orientation of fluoroscopes {a} and {b} differs between the exposures by '
@@ -371,9 +371,9 @@ def _check(found: RigFindings, pairs: PairScatter) -> Check:
         doubts[0].cause if doubts else cause,
         doubts[0].place if doubts else Place((a, b), name=ORIENTED),
         '' if doubts and doubts[0].kind is Kind.RIG_MOVED else CAPTURE,  # its cause contains it
-        numbers={'ratio': float(pairs.unexplained), 'noise_px': found.noise_px},
+        numbers={'ratio': float(pairs.unexplained), 'noise_px': findings.noise_px},
         value=off_px,
-        limit=max(found.noise_px, DOUBTFUL_GROWTH * predicted),
+        limit=max(findings.noise_px, DOUBTFUL_GROWTH * predicted),
         unit='px',
     )
 

@@ -537,27 +537,27 @@ def _unused_exposures(
     ]
 
 
-def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
+def _unused(diagnosis_of_unused: Diagnosis | None, half: int, rig: _Rig) -> Check:
     """Check that unused exposures show no further change of the rig."""
     part = f'the {("first", "second")[half - 1]} half of the exposures that were not used'
-    if rest is None:
+    if diagnosis_of_unused is None:
         return Check(
             Kind.UNUSED_EXPOSURES,
             f'{part} shows too little of the bodies',
             advice='take a longer recording',
         )
-    changes = [change for change in rest.changes if change.cause in OF_RIG]
+    changes = [change for change in diagnosis_of_unused.changes if change.cause in OF_RIG]
     text = f'{part} shows no further change'
     if changes:
         text = f'{part}: {_place_of(changes[0], rig)}: {_cause_text(changes[0], rig)}'
-    elif not rest.complete:
-        text = f'{len(rest.changes)} changes do not explain {part}'
+    elif not diagnosis_of_unused.complete:
+        text = f'{len(diagnosis_of_unused.changes)} changes do not explain {part}'
     return Check(
         Kind.UNUSED_EXPOSURES,
         text,
         advice='the rig changes while it is recorded: take another recording, or calibrate with '
         'the phantom',
-        value=float(len(changes) + (not rest.complete)),
+        value=float(len(changes) + (not diagnosis_of_unused.complete)),
         limit=0.0,
     )
 
@@ -606,7 +606,7 @@ def healing_document(outcome: HealingOutcome, parent: RigOrientation) -> dict[st
         'verdict': outcome.verdict,
         'exposures': outcome.exposures,
         'noise_factor': outcome.diagnosis.noise,
-        'nothing_else_probability': outcome.diagnosis.rest,
+        'nothing_else_probability': outcome.diagnosis.no_further_probability,
         'findings': [_finding_document(finding) for finding in outcome.findings],
         'checks': [
             {

@@ -128,11 +128,11 @@ def _intersected(
     return reconstruct_exposure(standing, calibrations, Intersector(orientation))
 
 
-def _met(found: ReconstructedFrame, phantom: Phantom) -> _Met:
+def _met(reconstructed: ReconstructedFrame, phantom: Phantom) -> _Met:
     """Return how well intersected targets fit the phantom."""
-    points = found.points
+    points = reconstructed.points
     matched = int(np.sum(points.rays > 1))
-    rows = phantom.index(found.target_id)
+    rows = phantom.index(reconstructed.target_id)
     offset = points.xyz_mm - phantom.xyz_mm[rows]
     met = np.isfinite(offset).all(axis=1)
     if not met.any():

@@ -108,18 +108,18 @@ class BagSelection:
                 'angle_deg'
             )
 
-    def frames(self, path: object, found: Frames) -> dict[str, list[Frame]]:
+    def frames(self, path: object, recorded: Frames) -> dict[str, list[Frame]]:
         """Return the frames in the time window. Raises DataError if a fluoroscope has none."""
-        origin = min(frame.stamp_ns for frames in found.values() for frame in frames)
+        origin = min(frame.stamp_ns for frames in recorded.values() for frame in frames)
         low = -math.inf if self.start_s is None else self.start_s
         high = math.inf if self.end_s is None else self.end_s
         selected = {
             name: [frame for frame in frames if low <= (frame.stamp_ns - origin) * 1e-9 <= high]
-            for name, frames in found.items()
+            for name, frames in recorded.items()
         }
         for name, frames in selected.items():
             if not frames:
-                last = max(frame.stamp_ns for frame in found[name])
+                last = max(frame.stamp_ns for frame in recorded[name])
                 raise DataError(
                     f'{path}: there is no frame of fluoroscope {name} in the time window, its '
                     f'last frame is at {(last - origin) * 1e-9:.3f} s'

@@ -319,29 +319,29 @@ class ExtractionNode(StreamNode):
         return bool(self._overlays[name].get_subscription_count())
 
     def _finish(
-        self, stream: ImageStream, task: Task, image: np.ndarray, found: Observations
+        self, stream: ImageStream, task: Task, image: np.ndarray, observed: Observations
     ) -> None:
         """Publish the targets found in an image, and count it."""
         header = task.message.header
-        if not found.reason:
+        if not observed.reason:
             self._publish_radiograph(stream.name, header, image)
             frame = Frame(
                 stream.name,
                 task.number,
-                found.target_id,
-                found.uv,
+                observed.target_id,
+                observed.uv,
                 (image.shape[1], image.shape[0]),
-                sigma=found.sigma,
+                sigma=observed.sigma,
                 stamp_ns=nanoseconds_from_stamp(header.stamp),
                 frame_id=header.frame_id,
             )
             self._observations[stream.name].publish(message_from_frame(frame))
             stream.add_latency(task.received_ns)
-        self._retract(stream, task, found)
-        stream.count(task.message, found)
-        if found.picture is not None:
+        self._retract(stream, task, observed)
+        stream.count(task.message, observed)
+        if observed.picture is not None:
             self._overlays[stream.name].publish(
-                message_from_image(header, np.ascontiguousarray(found.picture))
+                message_from_image(header, np.ascontiguousarray(observed.picture))
             )
 
     def _publish_radiograph(self, name: str, header: Header, image: np.ndarray) -> None:
@@ -351,11 +351,11 @@ class ExtractionNode(StreamNode):
             jpeg = array('B', small_jpeg(image, RADIOGRAPH_PX))
             publisher.publish(CompressedImage(header=header, format='jpeg', data=jpeg))
 
-    def _retract(self, stream: ImageStream, task: Task, found: Observations) -> None:
+    def _retract(self, stream: ImageStream, task: Task, observed: Observations) -> None:
         """Publish which ids of earlier images are retracted."""
         headers = stream.headers
         remember(headers, task.number, task.message.header, REVISED)
-        for retraction in found.retracted:
+        for retraction in observed.retracted:
             if retraction.frame not in headers:
                 continue
             message = Retraction(header=headers[retraction.frame], frame_number=retraction.frame)

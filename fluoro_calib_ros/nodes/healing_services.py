@@ -208,11 +208,11 @@ class Healing(Job):
         """Return the frames of the next seconds, fewer if the goal is cancelled."""
         collection = MarkerCollection(rig.learned.bodies, rig.calibrations)
 
-        def tell() -> None:
+        def publish() -> None:
             goal.publish_feedback(Heal.Feedback(stage='collecting', frames=collection.count))
 
-        tell()
-        timer = self._node.create_timer(0.5, tell)
+        publish()
+        timer = self._node.create_timer(0.5, publish)
         self._collection = collection
         try:
             await within(self._node, seconds, collection.done, collection.finish)

@@ -113,8 +113,8 @@ class Handler(RequestHandler):
         self.set_header('Content-Type', 'text/plain; charset=utf-8')
         self.finish(str(getattr(error, 'log_message', None) or 'the request cannot be answered'))
 
-    def _is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self._desk.options.token.encode())
+    def _is_token(self, text: str) -> bool:
+        return hmac.compare_digest(text.encode(), self._desk.options.token.encode())
 
     def _finish_json(self, value: dict[str, Any]) -> None:
         self.finish(to_json_values(value))

@@ -280,16 +280,16 @@ _WORDS = {
 }
 
 
-def _check_given(declaration: Option, given: Parameter) -> None:
+def _check_given(declaration: Option, parameter: Parameter) -> None:
     """Raise StartError for a value that is invalid for a parameter, in the words of its option."""
     name, default = declaration.name, declaration.default
     listed = list(default) if isinstance(default, tuple) else default
-    empty = given.type_ == Parameter.Type.NOT_SET or given.value == []  # of any type
-    if not empty and given.type_ != Parameter.Type.from_parameter_value(listed):
-        value = printable(shortened(repr(given.value)))
+    empty = parameter.type_ == Parameter.Type.NOT_SET or parameter.value == []  # of any type
+    if not empty and parameter.type_ != Parameter.Type.from_parameter_value(listed):
+        value = printable(shortened(repr(parameter.value)))
         raise StartError(f'parameter {name} must be {_WORDS[type(default)]}, not {value}')
     try:
-        declaration.validate(_tuple_or_value(declaration, given.value))
+        declaration.validate(_tuple_or_value(declaration, parameter.value))
     except ValueError as error:
         raise StartError(f'parameter {error}') from None
 

@@ -663,45 +663,45 @@ def _migrated(body: Body, adjustment: _Adjustment, known: NDArray[np.bool_]) -> 
 
 
 def _against_others(
-    given: NDArray[np.float64],
-    found: NDArray[np.float64],
+    ct: NDArray[np.float64],
+    adjusted: NDArray[np.float64],
     sd: NDArray[np.float64],
     marker: int,
-    kept: Sequence[int],
+    markers: Sequence[int],
 ) -> float:
     """Return the squared deviation of a marker from CT over its variance, fitting the others."""
-    others = [k for k in kept if k != marker]
+    others = [k for k in markers if k != marker]
     weight = 1 / sd[others] ** 2
-    rotation, shift = fitted_pose(found[others], given[others], weight)
-    arm = np.concatenate([given[others], given[[marker]]]) - given[others].mean(axis=0)
+    rotation, shift = fitted_pose(adjusted[others], ct[others], weight)
+    arm = np.concatenate([ct[others], ct[[marker]]]) - ct[others].mean(axis=0)
     motion = by_pose(arm)
     normal = (np.swapaxes(motion[:-1], 1, 2) @ (motion[:-1] * weight[:, None, None])).sum(axis=0)
-    deviation = rotation @ found[marker] + shift - given[marker]
+    deviation = rotation @ adjusted[marker] + shift - ct[marker]
     covariance = sd[marker] ** 2 * np.eye(3) + motion[-1] @ np.linalg.solve(normal, motion[-1].T)
     return float(deviation @ np.linalg.solve(covariance, deviation))
 
 
 def _misfit(
-    given: NDArray[np.float64], found: NDArray[np.float64], sd: NDArray[np.float64]
+    ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> float:
     """Return the weighted squares of a fit of coordinates (k, 3) to CT, over their limit."""
-    rotation, shift = fitted_pose(found, given, 1 / sd**2)
-    deviation = (found @ rotation.T + shift - given) / sd[:, None]
-    return float(np.sum(deviation**2) / chdtri(3 * len(given) - POSE_SIZE, REJECT_TAIL))
+    rotation, shift = fitted_pose(adjusted, ct, 1 / sd**2)
+    deviation = (adjusted @ rotation.T + shift - ct) / sd[:, None]
+    return float(np.sum(deviation**2) / chdtri(3 * len(ct) - POSE_SIZE, REJECT_TAIL))
 
 
 def _exchanged(
-    given: NDArray[np.float64], found: NDArray[np.float64], sd: NDArray[np.float64]
+    ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> tuple[int, int] | None:
     """Return two markers that contradict CT, but agree with it when exchanged; or None."""
-    if _misfit(given, found, sd) <= 1:
+    if _misfit(ct, adjusted, sd) <= 1:
         return None
-    pairs = list(combinations(range(len(given)), 2))
+    pairs = list(combinations(range(len(ct)), 2))
     misfits = []
     for first, second in pairs:
-        order = np.arange(len(given))
+        order = np.arange(len(ct))
         order[[first, second]] = second, first
-        misfits.append(_misfit(given[order], found, sd))
+        misfits.append(_misfit(ct[order], adjusted, sd))
     best = int(np.argmin(misfits))
     return pairs[best] if misfits[best] <= 1 else None
 

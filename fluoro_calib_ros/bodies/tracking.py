@@ -223,12 +223,12 @@ class BodyTracker:
         )
 
 
-def _filled_backwards(taken: Sequence[_Taken]) -> list[_Taken]:
+def _filled_backwards(exposures: Sequence[_Taken]) -> list[_Taken]:
     """Fill unknown constant errors of a body with those of the following exposures."""
     out: list[_Taken] = []
-    fixed = taken[-1].fixed
-    root = taken[-1].rig_root
-    for exposure in reversed(taken):
+    fixed = exposures[-1].fixed
+    root = exposures[-1].rig_root
+    for exposure in reversed(exposures):
         fixed = np.where(np.isnan(exposure.fixed), fixed, exposure.fixed)
         root = np.where(np.isnan(exposure.rig_root), root, exposure.rig_root)
         out.append(replace(exposure, fixed=fixed, rig_root=root))

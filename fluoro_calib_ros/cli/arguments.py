@@ -117,18 +117,18 @@ def add_options(
         add_option(parser, options[name], **changes.get(name, {}))
 
 
-def add_address(parser: argparse.ArgumentParser, what: str, port: int) -> None:
-    """Add --host and --port of a server, with a default port; what: name of the server."""
+def add_address(parser: argparse.ArgumentParser, server: str, port: int) -> None:
+    """Add --host and --port of a server, with a default port; server: name of the server."""
     parser.add_argument(
         '--host',
         default='127.0.0.1',
-        help=f'address of {what}, 0.0.0.0 for all interfaces (default: 127.0.0.1)',
+        help=f'address of {server}, 0.0.0.0 for all interfaces (default: 127.0.0.1)',
     )
     parser.add_argument(
         '--port',
         type=number_in(0, 65535, int),
         default=port,
-        help=f'port of {what}, 0 for any free port (default: {port})',
+        help=f'port of {server}, 0 for any free port (default: {port})',
     )
 
 

@@ -47,12 +47,12 @@ def os_error_reason(error: OSError) -> str:
 
 
 @contextmanager
-def os_errors(path: object, what: str) -> Iterator[None]:
-    """Turn an OSError into a DataError; what: the failure, such as 'cannot be read'."""
+def os_errors(path: object, failure: str) -> Iterator[None]:
+    """Turn an OSError into a DataError; failure: the failure, such as 'cannot be read'."""
     try:
         yield
     except OSError as error:
-        raise DataError(f'{path}: {what} ({os_error_reason(error)})') from None
+        raise DataError(f'{path}: {failure} ({os_error_reason(error)})') from None
 
 
 def check_regular_file(path: PathLike) -> None:

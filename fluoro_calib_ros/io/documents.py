@@ -78,9 +78,9 @@ class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[mi
         if any(key.tag == 'tag:yaml.org,2002:merge' for key, _ in node.value):
             self._refuse('merged keys', node)
 
-    def _refuse(self, what: str, node: Any) -> NoReturn:
+    def _refuse(self, construct: str, node: Any) -> NoReturn:
         raise yaml.constructor.ConstructorError(
-            None, None, f'{what} are not allowed', node.start_mark
+            None, None, f'{construct} are not allowed', node.start_mark
         )
 
 

@@ -113,9 +113,11 @@ def _factor(pairs: Sequence[tuple[_Residuals, _Residuals]]) -> float:
     return factor if factor > chance else 1.0
 
 
-def _explains(factor: float, found: Sequence[_Residuals]) -> bool:
+def _explains(factor: float, residuals: Sequence[_Residuals]) -> bool:
     """Return whether residuals agree with noise larger by a factor than the calibration's."""
-    size = [np.abs(part.value) / np.hypot(factor * part.noise_sd, part.other_sd) for part in found]
+    size = [
+        np.abs(part.value) / np.hypot(factor * part.noise_sd, part.other_sd) for part in residuals
+    ]
     return bool(np.median(np.concatenate(size)) <= MAX_UNEXPLAINED * NORMAL_MEDIAN)
 
 

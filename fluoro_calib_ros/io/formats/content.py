@@ -268,14 +268,15 @@ class FileSettings:
             )
         return UNITS_MM[self.units]
 
-    def unit_or(self, default: str, what: str) -> tuple[float, tuple[str, ...]]:
+    def unit_or(self, default: str, subject: str) -> tuple[float, tuple[str, ...]]:
         """Return the unit in mm, and a note if it is the default of the format."""
         if self.units is not None:
             return UNITS_MM[self.units], ()
         note = (
-            f'{what}: lengths in {default}, as the format does not state a unit; change it with '
+            f'{subject}: lengths in {default}, as the format does not state a unit; change it '
+            'with --units'
         )
-        return UNITS_MM[default], (note + '--units',)
+        return UNITS_MM[default], (note,)
 
 
 @dataclass(frozen=True)

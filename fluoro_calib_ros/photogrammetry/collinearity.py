@@ -195,7 +195,7 @@ class AdditionalParameters:
                 out[:k, :k] = mirror_lower(lower)
                 out[k : 2 * k, k : 2 * k] = out[:k, :k]
             if self.grouped is not None:
-                self._add_own(self.grouped, weight, out)
+                self._add_grouped(self.grouped, weight, out)
             return out
         lower = out.T
         for f, _ in self._by_axis():
@@ -203,14 +203,14 @@ class AdditionalParameters:
             lower = blas.dsyrk(1.0, weighted.T, beta=1.0, c=lower, lower=1, overwrite_c=1)
         return mirror_lower(lower)
 
-    def _add_own(
-        self, own: GroupedFunctions, weight: NDArray[np.float64], out: NDArray[np.float64]
+    def _add_grouped(
+        self, grouped: GroupedFunctions, weight: NDArray[np.float64], out: NDArray[np.float64]
     ) -> None:
         """Fill in the rows and columns of functions of groups in a normal matrix."""
-        weighted = weight[:, None, None] * own.values
-        groups = int(own.group[-1]) + 1
-        products = self.grouped_products(own.group, groups, weighted)
-        rows = products.reshape(own.count, self.count)
+        weighted = weight[:, None, None] * grouped.values
+        groups = int(grouped.group[-1]) + 1
+        products = self.grouped_products(grouped.group, groups, weighted)
+        rows = products.reshape(grouped.count, self.count)
         out[self._common :] = rows
         out[: self._common, self._common :] = rows[:, : self._common].T
 
@@ -289,7 +289,7 @@ class AdditionalParameters:
         out[:, 0, 1] = np.einsum('np,np->n', fu @ common[cu, cv], fv)
         out[:, 1, 0] = out[:, 0, 1]
         if self.grouped is not None:
-            out += self._own_covariance(self.grouped, covariance, part)
+            out += self._grouped_covariance(self.grouped, covariance, part)
         return out
 
     def correction_variance(
@@ -306,17 +306,17 @@ class AdditionalParameters:
             for f, _ in self._by_axis():
                 out += np.einsum('np,np->n', f[part] @ common, f[part])
         if self.grouped is not None:
-            own_covariance = self._own_covariance(self.grouped, covariance, part)
+            own_covariance = self._grouped_covariance(self.grouped, covariance, part)
             out += np.trace(own_covariance, axis1=1, axis2=2)
         return out
 
-    def _own_covariance(
-        self, own: GroupedFunctions, covariance: NDArray[np.float64], part: slice
+    def _grouped_covariance(
+        self, grouped: GroupedFunctions, covariance: NDArray[np.float64], part: slice
     ) -> NDArray[np.float64]:
         """Return the part (n, 2, 2) of group functions in the covariances of the corrections."""
-        values = own.values[part]
-        group = own.group[part]
-        t = own.values.shape[2]
+        values = grouped.values[part]
+        group = grouped.group[part]
+        t = grouped.values.shape[2]
         rows = covariance[self._common :]
         with_common = rows[:, : self._common].reshape(-1, t, self._common)
         mixed = values @ self._common_cross_covariance(with_common, group, part)

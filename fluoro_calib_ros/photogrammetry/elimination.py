@@ -192,7 +192,7 @@ class Elimination(ABC):
 
     def _remaining_matrix(
         self,
-        own: NDArray[np.float64],
+        remaining_blocks: NDArray[np.float64],
         own_globals: NDArray[np.float64],
         equations: NormalEquations,
     ) -> NDArray[np.float64]:
@@ -202,7 +202,7 @@ class Elimination(ABC):
         border = self.layout.globals
         free = self.network.layout.free
         out = np.zeros((self.layout.size, self.layout.size))
-        out[rows[:, :, None], rows[:, None, :]] = own
+        out[rows[:, :, None], rows[:, None, :]] = remaining_blocks
         out[blocks, border] = own_globals.reshape(rows.size, -1)[:, free]
         out[border, blocks] = out[blocks, border].T
         out[border, border] = equations.gg[np.ix_(free, free)]

@@ -174,7 +174,7 @@ PHANTOM = {'phantom': BAGS / 'phantom.csv'}
         (
             'player_node',
             {'bag': BAGS / 'calibration', 'rate': 'fast'},
-            "parameter rate is a number, not 'fast'",
+            "parameter rate must be a number, not 'fast'",
         ),
         (
             'player_node',

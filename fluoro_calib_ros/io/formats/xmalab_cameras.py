@@ -238,8 +238,8 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
         except ValueError as error:
             raise DataError(f'{path}, {name}: {error}') from None
     note = (
-        f'{path}: rows are read as downwards, as in DLTdv8: otherwise the origin would be behind '
-        'the cameras '
+        f'{path}: rows are counted downwards, as in DLTdv8: otherwise the origin would be behind '
+        'the cameras'
     )
     return Content(cameras=tuple(cameras), notes=(note,) if downwards else ())
 

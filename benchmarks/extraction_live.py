@@ -439,7 +439,7 @@ PARTS: dict[str, tuple[tuple[type, str], ...]] = {
     'fit': ((MarkerMeasurement, 'measure'),),
     'ids': (
         (JoinedViews, '_decide'),
-        *((MarkerWatch, n) for n in ('shadows_met', 'found_again', 'other_shadows')),
+        *((MarkerWatch, n) for n in ('shadows_met', 'recovered', 'other_shadows')),
         (MarkerWatch, 'moving_alone'),
     ),
     'rays and bodies': (

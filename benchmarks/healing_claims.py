@@ -57,7 +57,9 @@ def healed(recording: Recording) -> HealedRig:
     knock = diagnostician.knocks()[0]
     prior = adjustment.healthy_prior(observed, scale).widened(diagnostician.sd_of(knock))
     solution = adjustment.solve(observed, prior, (np.zeros(adjustment.size), poses))
-    known = Diagnosis((knock,), (1.0,), (None,), observed, prior, solution, noise=1.0, rest=0.0)
+    known = Diagnosis(
+        (knock,), (1.0,), (None,), observed, prior, solution, noise=1.0, no_further_probability=0.0
+    )
     return healed_rig(diagnostician, known, 1, len(used))
 
 

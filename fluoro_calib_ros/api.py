@@ -260,11 +260,11 @@ def _calibrated(
 ) -> CalibrationOutcome:
     """Run a calibration that reports its rounds in the same way as the steps of its validation."""
 
-    def tell(names: str, this: Round) -> None:
+    def report(names: str, step: Round) -> None:
         if progress is not None:
-            progress(f'{names}: {this}', this.iteration, 0)
+            progress(f'{names}: {step}', step.iteration, 0)
 
-    return run_calibration(request, validate=validated, progress=tell, report_step=progress)
+    return run_calibration(request, validate=validated, progress=report, report_step=progress)
 
 
 def correct(

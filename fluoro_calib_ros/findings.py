@@ -234,13 +234,13 @@ class Finding:
             return self
         return replace(self, place=replace(self.place, name=sentence_of(where, self.place)))
 
-    def explained_by(self, why: Finding | None) -> Finding:
-        """Return the finding with kind and advice of `why`, if any, both causes and numbers."""
-        if why is None:
+    def explained_by(self, reason: Finding | None) -> Finding:
+        """Return the finding with kind and advice of `reason`, if any, both causes and numbers."""
+        if reason is None:
             return self
-        numbers = {**self.numbers, **why.numbers}
-        cause = f'{self.cause}; {why.cause}'
-        return replace(self, kind=why.kind, cause=cause, advice=why.advice, numbers=numbers)
+        numbers = {**self.numbers, **reason.numbers}
+        cause = f'{self.cause}; {reason.cause}'
+        return replace(self, kind=reason.kind, cause=cause, advice=reason.advice, numbers=numbers)
 
 
 def sentences(findings: Iterable[Finding], severity: Severity | None = None) -> list[str]:

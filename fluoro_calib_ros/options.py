@@ -56,11 +56,13 @@ class Option:
         """Raise ValueError, starting with the name of the option, for an invalid value."""
         if self.choices:
             if value not in self.choices:
-                raise ValueError(f'{self.name} is one of {", ".join(self.choices)}, not {value!r}')
+                raise ValueError(
+                    f'{self.name} must be one of {", ".join(self.choices)}, not {value!r}'
+                )
         elif value is not None and (self.minimum is not None or self.maximum is not None):
             values = value if isinstance(value, tuple) else (value,)
             if not all(self._in_range(v) for v in values):
-                raise ValueError(f'{self.name} is {self._range()}, not {value!r}')
+                raise ValueError(f'{self.name} must be {self._range()}, not {value!r}')
 
     def _in_range(self, value: float) -> bool:
         above = self.minimum is None or value >= self.minimum
@@ -69,9 +71,9 @@ class Option:
 
     def _range(self) -> str:
         if self.minimum is None:
-            return f'{self.maximum:g} at most'
+            return f'at most {self.maximum:g}'
         if self.maximum is None:
-            return f'{self.minimum:g} at least'
+            return f'at least {self.minimum:g}'
         return f'between {self.minimum:g} and {self.maximum:g}'
 
 

@@ -68,18 +68,18 @@ class WorkerProcess:
     One thread calls it; any thread may close it. After its process has ended, the next call starts
     a new one. Keyboard interrupts do not reach the process.
 
-    make: picklable; returns the function, in the process. what: description of the process for
+    make: picklable; returns the function, in the process. description: of the process, for
     error messages: 'the process of ...'.
     """
 
     def __init__(
         self,
         make: Callable[[], Callable[..., Any]],
-        what: str,
+        description: str,
         resources: Resources = Resources(),
     ) -> None:
         self._make = make
-        self._what = what
+        self._what = description
         self._resources = resources
         self._lock = threading.Lock()
         self._closed = False

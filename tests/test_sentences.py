@@ -321,7 +321,7 @@ def no_orientation():
 def saved_note():
     with mock.patch.multiple(
         result_folder,
-        read_result=lambda _: {'rig_note': 'orientation of the rig: not from exposure 5'},
+        read_result=lambda _: {'rig_note': 'orientation of the rig: without exposure 5'},
         saved_orientation=lambda _: None,
     ):
         return result_folder.saved_rig_note('result')
@@ -539,13 +539,13 @@ MAKERS = {
 SENTENCES = {
     Kind.DATA: 'phantom.csv: the file is empty',
     Kind.BEADS: (
-        'bead # lies # mm from its survey, the worst of #: survey again, or give a larger sd, '
-        'and calibrate again'
+        'bead # lies # mm from its survey, the largest deviation of #: survey again, or give a '
+        'larger sd, and calibrate again'
     ),
     Kind.DISTANCES: (
-        'distances between beads differ from the survey by # mm, # mm are expected (scale #, '
-        'sd #): the survey is less precise than its sd says, or the calibration is wrong if '
-        'other checks fail too; survey the phantom again, or give a larger sd'
+        'distances between beads differ from the survey by # mm, where # mm is expected (scale '
+        '#, sd #): the survey is less precise than its sd states, or, if other checks fail too, '
+        'the calibration is wrong; survey the phantom again, or give a larger sd'
     ),
     Kind.DRIFT: (
         'fluoroscope a: earlier and later exposures differ by # px, most at the @ of the image '
@@ -553,18 +553,17 @@ SENTENCES = {
         'of them again in one session, with nothing switched, moved or warming up'
     ),
     Kind.EXPOSURES: (
-        'fluoroscope a: exposure # fits the calibration of the others worst, with # times the '
-        'expected residuals: inspect it (phantom or fluoroscope moved, wrong ids), leave it '
-        'out by a decision in doubtful.csv and calibrate again'
+        'fluoroscope a: exposure # deviates most from the calibration of the others, its '
+        'residuals are # times the expected ones: inspect it (phantom or fluoroscope moved, '
+        'wrong ids), exclude it by a decision in doubtful.csv and calibrate again'
     ),
     Kind.HALVES: (
-        'fluoroscope a: two halves of the exposures give corrections that differ by # px, '
-        'where # px is predicted, most at the @ of the image (about u #, v #): take # more '
-        'exposures (there are #) that show beads there, and see that phantom and fluoroscope '
-        'stand still in each'
+        'fluoroscope a: two halves of the exposures give corrections that differ by # px, where '
+        '# px is predicted, most at the @ of the image (about u #, v #): take # more exposures '
+        '(there are #) that show beads there, and keep phantom and fluoroscope still during each'
     ),
     Kind.HELD_OUT: (
-        'fluoroscope a: residuals of exposures held out are # px, # px are expected: the '
+        'fluoroscope a: residuals of held-out exposures are # px, where # px is expected: the '
         'calibration does not hold for exposures it has not used; take # more exposures (there '
         'are #) in other poses'
     ),
@@ -574,17 +573,16 @@ SENTENCES = {
         '(--model auto), or take # more exposures (there are #), or a phantom with more beads'
     ),
     Kind.SHAPE: (
-        'the survey of the phantom is strained against the images by # % along (#, #, #), which '
-        'displaces beads by # mm (RMS): survey the phantom again, or give a larger sd, and '
+        'the survey of the phantom is strained relative to the images by # % along (#, #, #), '
+        'which displaces beads by # mm (RMS): survey the phantom again, or give a larger sd, and '
         'calibrate again'
     ),
     Kind.VARIATION: (
         'fluoroscope a: the distortion differs between exposures by # px (chi2/dof #, constant '
-        'up to #): a C-arm at another angle, a lens that was focused or zoomed, a source or '
-        'detector that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
-        'take # more exposures (there are #) at the angle and setting that are used, or '
-        'calibrate each; or give the angle of the C-arm with each exposure (angle_deg, or '
-        'joint_states)'
+        'up to #): a C-arm at another angle, a refocused or zoomed lens, an unstable source or '
+        'detector, or a phantom that moved, was bent or has a wrong survey; take # more '
+        'exposures (there are #) at the angle and setting in use, or calibrate each; or give the '
+        'angle of the C-arm with each exposure (angle_deg, or joint_states)'
     ),
     Kind.WHITENESS: (
         'fluoroscope a: the residuals have a trend of # px, most at the @ of the image (about '
@@ -593,18 +591,18 @@ SENTENCES = {
         '(--model auto)'
     ),
     Kind.WORST_AREA: (
-        'fluoroscope a: the worst mean residual of an area, # px, is at the @ of the image '
-        '(about u #, v #): take # more exposures (there are #) that show beads there, or '
-        'choose another model'
+        'fluoroscope a: the largest mean residual of an area, # px, is at the @ of the image '
+        '(about u #, v #): take # more exposures (there are #) that show beads there, or choose '
+        'another model'
     ),
     Kind.GIVEN_INTERIOR: (
-        'fluoroscope a: the given interior orientation, c = # (sd #), xp = # (sd #), yp = # '
-        '(sd #) px, contradicts the exposures, which show c = # (sd #), xp = # (sd #), yp = # '
-        '(sd #) px: the residuals are # px with what was given and # px without: give the '
-        'right value, a larger --interior-sd, or none'
+        'fluoroscope a: the given interior orientation, c = # (sd #), xp = # (sd #), yp = # (sd '
+        '#) px, contradicts the exposures, which show c = # (sd #), xp = # (sd #), yp = # (sd #) '
+        'px: the residuals are # px with the given values and # px without: give the correct '
+        'value, a larger --interior-sd, or none'
     ),
     Kind.VALIDATION: (
-        'the validation could not be made: fluoroscope a: # exposures are too few, # are '
+        'the validation could not be performed: fluoroscope a: # exposures are too few, # are '
         'needed, # more have too few targets'
     ),
     Kind.COPIED_EXPOSURE: ('fluoroscope a, exposure #: the image points are those of exposure #'),
@@ -616,13 +614,11 @@ SENTENCES = {
         'fluoroscope a, exposure #: only # % of the image points fit, the others are false matches'
     ),
     Kind.FEW_RAYS: (
-        '# targets are seen in fewer than # exposures, which do not determine them safely '
-        'without surveyed coordinates: #, #, #, #, # and # more'
+        '# targets are seen in fewer than # exposures, too few to determine them without '
+        'surveyed coordinates: #, #, #, #, # and # more'
     ),
     Kind.FEW_TARGETS: 'fluoroscope a, exposure #: # targets are too few, # are needed',
-    Kind.NOT_ORIENTED: (
-        'fluoroscope a, exposure #: all image points lie on one line or in one place'
-    ),
+    Kind.NOT_ORIENTED: ('fluoroscope a, exposure #: all image points are collinear or coincide'),
     Kind.POOR_FIT: (
         'fluoroscope a, exposure #: the image points do not fit the phantom, their residuals '
         'are about # px'
@@ -638,68 +634,66 @@ SENTENCES = {
     ),
     Kind.UNDETERMINED: (
         'the exposures do not determine the unknowns: the orientation of exposure # of a is '
-        'left open; add exposures with the phantom turned and moved, with more targets'
+        'undetermined; add exposures with the phantom turned and moved, with more targets'
     ),
     Kind.WEAK_INTERSECTION: (
         '# beads are not surveyed, their rays meet at less than # degrees: #, #, #, #, # and # '
         'more'
     ),
     Kind.UNTILTED_TARGETS: (
-        'fluoroscope a: the targets are flat and not tilted, so that the principal distance '
-        'cannot be found: tilt the target by # degrees and more, or give the principal distance'
+        'fluoroscope a: the targets are flat and not tilted: the principal distance is '
+        'undetermined: tilt the target by # degrees or more, or give the principal distance'
     ),
     Kind.DUPLICATE_NAME: (
-        'fluoroscopes a and A differ in capital letters only: this is one fluoroscope, or name '
-        'them otherwise'
+        'fluoroscopes a and A differ only in case: use one name for one fluoroscope, or rename '
+        'one of two'
     ),
     Kind.FRAMES_SHIFTED: (
         '# % of the rays miss each other: the frame numbers of fluoroscope b are too small by #'
     ),
     Kind.IDS_REVERSED: (
-        'the target ids run in the opposite order: with the right ones the image points fit '
-        'the phantom'
+        'the target ids run in the opposite order: with the correct ids the image points fit the '
+        'phantom'
     ),
     Kind.IDS_SHIFTED: (
-        'the target ids are too large by #: with the right ones the image points fit the phantom'
+        'the target ids are too large by #: with the correct ids the image points fit the phantom'
     ),
     Kind.IMAGE_MIRRORED: (
-        'the image is mirrored: v must run down and u to the right, and neither they nor the '
-        'axes of the phantom may be interchanged'
+        'the image is mirrored: u must run to the right and v down, and neither u and v nor axes '
+        'of the phantom may be interchanged'
     ),
     Kind.IMAGE_TRANSPOSED: '# % of the rays miss each other: u and v are interchanged',
     Kind.IMPLAUSIBLE_NUMBER: (
         'fluoroscope a, exposure #: sigma of target # is # px, between # and # px are plausible'
     ),
     Kind.MIXED_UNITS: (
-        'phantom: # targets, #, #, #, #, # and # more, are in another unit than the others: '
-        'they fit when their coordinates are multiplied by # (cm in place of mm)'
+        'phantom: # targets, #, #, #, #, # and # more, are in a different unit from the others: '
+        'they fit when their coordinates are multiplied by # (cm instead of mm)'
     ),
     Kind.OTHER_PHANTOM: (
         'fluoroscope a: the image points do not fit the phantom: this is another phantom, or '
         'the target ids are wrong'
     ),
     Kind.REMOTE_TARGETS: (
-        'phantom: target # is # mm from the middle of the others, most of which are within # '
-        'mm: a wrong coordinate, another unit, or a fill value for targets that are not '
-        'surveyed'
+        'phantom: target # is # mm from the centre of the others, most of which are within # mm: '
+        'a wrong coordinate, another unit, or a fill value for targets that are not surveyed'
     ),
     Kind.REPEATED_COORDINATES: (
         'phantom: targets #, # are all at (#, #, #) mm: a repeated row, or a fill value for '
         'targets that are not surveyed'
     ),
     Kind.SOURCE_TOO_NEAR: (
-        'the source would be # mm from a phantom that is # mm large, nearer than that of a '
-        'fluoroscope: the principal distance is wrong, or the images are those of a wide-angle '
-        'camera'
+        'the source would be # mm from a phantom that is # mm large, closer than in a '
+        'fluoroscope: the principal distance is wrong, or the images are from a wide-angle camera'
     ),
     Kind.WRONG_IMAGE_SIZE: (
         'the image points reach only to u = #, v = # of an image of # x # px: the image size '
         'is wrong, or the phantom covers one corner only'
     ),
     Kind.WRONG_KNOWN_ORIENTATION: (
-        'fluoroscope a: the known orientation does not fit, image points are # px off in the '
-        'median: check the unit and the frame of the lab, that R and t lead from the lab to '
-        'the sensor, and that v runs down'
+        'fluoroscope a: the known orientation does not fit: the median error of the image points '
+        'is # px: check the unit and the frame of the lab, that R and t transform from the lab '
+        'to the sensor, and that v runs down'
     ),
     Kind.WRONG_UNIT: (
         'the coordinates of the phantom are not in mm: it would be # mm large and # mm from '
@@ -717,25 +711,24 @@ SENTENCES = {
     ),
     Kind.LARGE_RESIDUALS: (
         'the residuals are too large: RMSE # px after the correction, at most # px are '
-        'plausible; false matches, another phantom, or the distortion changed between the '
-        'exposures'
+        'plausible; possible causes: false matches, another phantom, or a change of the '
+        'distortion between the exposures'
     ),
     Kind.PRINCIPAL_POINT_OFF: (
-        'the principal point (#, #) is # px from the middle of the image: wrong target ids, a '
+        'the principal point (#, #) is # px from the centre of the image: wrong target ids, a '
         'wrong image size, or another phantom'
     ),
     Kind.WRONG_PRINCIPAL_DISTANCE: (
-        'the principal distance is fixed at # px, but the exposures show about # px: it has to '
-        'be given in pixels'
+        'the principal distance is fixed at # px, but the exposures show about # px: give it in '
+        'pixels'
     ),
     Kind.CORRECTED_ALREADY: (
-        'fluoroscope a: the image points are corrected already, their RMSE is # px with the '
-        'correction and # px without: give the observed ones'
+        'fluoroscope a: the image points are already corrected, their RMSE is # px with the '
+        'correction and # px without: give the observed image points'
     ),
     Kind.POOR_CALIBRATION_FIT: (
         'fluoroscope a: RMSE # px with the calibration fixed, # times the noise with which it '
-        'was determined: the image has changed, or the calibration is that of another '
-        'fluoroscope'
+        'was determined: the image has changed, or the calibration is of another fluoroscope'
     ),
     Kind.NO_COMMON_TARGETS: (
         'no target is seen by two fluoroscopes in one exposure: the target ids of the '
@@ -743,19 +736,19 @@ SENTENCES = {
     ),
     Kind.NOISE_OBSERVED: (
         'the image points have no sigma, and their rays show a noise of # px where the '
-        'calibration has # px; that of the rays is taken: give their sigma, if it is known'
+        'calibration has # px; the noise of the rays is used: give their sigma, if it is known'
     ),
     Kind.PAIRS_CONTRADICT: (
         'orientation of the rig: the exposures contradict each other: the relative orientation '
         'of fluoroscopes a and b differs between them by # px, # times its standard deviation; '
-        'frames with the same number are not of the same exposure, the phantom moved between '
-        'them, the fluoroscopes or their images do not stand still, or the corrections do not '
-        'hold in all of them'
+        'frames with the same number are from different exposures, the phantom moved between '
+        'them, a fluoroscope or its image is unstable, or the corrections do not hold in all of '
+        'them'
     ),
     Kind.PAIRS_EXCLUDED: (
-        'orientation of the rig: not from exposure #, in which fluoroscopes a and b stand '
-        'otherwise to each other by # px: the frames are not of one exposure, or the phantom '
-        'moved between them'
+        'orientation of the rig: without exposure #, where the relative orientation of '
+        'fluoroscopes a and b differs by # px: the frames are from different exposures, or the '
+        'phantom moved between them'
     ),
     Kind.RAYS_DO_NOT_MEET: (
         '# % of the rays miss each other: the frames, target ids or image coordinates do not '
@@ -764,15 +757,15 @@ SENTENCES = {
     ),
     Kind.RIG_DEPENDS_ON_ANGLE: (
         'orientation of the rig: the relative orientation of fluoroscopes a and b changes with '
-        'the angle of the C-arm, by # px: it is that of the mean angle; orient the rig from a '
-        'capture at the angle that is used'
+        'the angle of the C-arm, by # px: it holds for the mean angle; orient the rig from a '
+        'capture at the angle in use'
     ),
     Kind.RIG_MOVED: (
-        'fluoroscopes a and b stand otherwise to each other than in the orientation before, by '
-        '# mm and # degrees (distance of the sources # times): one of them was moved since, '
-        'the frames are not of one exposure, or this is another phantom'
+        'the relative orientation of fluoroscopes a and b differs from the previous one by # mm '
+        'and # degrees (distance of the sources # times): one of them was moved since, the '
+        'frames are from different exposures, or this is another phantom'
     ),
-    Kind.RIG_NOTE: 'orientation of the rig: not from exposure #',
+    Kind.RIG_NOTE: 'orientation of the rig: without exposure #',
     Kind.RIG_NOT_ORIENTED: (
         'no orientation of the rig: fluoroscopes a and b: no exposures have the same number'
     ),
@@ -782,70 +775,71 @@ SENTENCES = {
         'capture'
     ),
     Kind.TAKEN_ON_TRUST: (
-        'the orientation of fluoroscopes a and b takes on trust that frames of one number are of '
-        'one exposure, or that the phantom stands still (they have no stamps): a delay that is '
-        'always the same looks like another orientation where the phantom turns steadily'
+        'the orientation of fluoroscopes a and b assumes that frames with the same number are '
+        'simultaneous, or that the phantom stands still (they have no stamps): if the phantom '
+        'turns steadily, a constant delay looks like another orientation'
     ),
     Kind.POSE_AMBIGUOUS: (
         'the pose is ambiguous: the phantom fits nearly as well in another one (# beads '
         'instead of #); mark it by beads that break its symmetry'
     ),
     Kind.MARKER_FOUND_AGAIN: 'found again after # images',
-    Kind.MARKER_MOVES_ALONE: 'it moves unlike the markers that it moved with',
-    Kind.OTHER_SHADOW: 'another shadow was as near to where it was expected',
-    Kind.SHADOWS_MET: 'their shadows met and parted',
+    Kind.MARKER_MOVES_ALONE: 'it no longer moves with its former neighbours',
+    Kind.OTHER_SHADOW: 'another shadow was as close to its prediction',
+    Kind.SHADOWS_MET: 'their shadows overlapped and separated',
     Kind.NOT_IN_BOTH: 'fluoroscope b is in one only',
     Kind.WRONG_FORMAT: (
         'cam.csv: this looks like MayaCam # (mayacam2), which has cameras, but a phantom is needed'
     ),
     Kind.FEW_BEADS: 'only # beads are found in the image, at least # are needed',
     Kind.GRID_NOT_MARKED: (
-        'the grid is taken as one without marks: ids count from the hole nearest to the middle of '
-        'each image: this serves the distortion of one fluoroscope, not the orientation of two'
+        'the grid is treated as unmarked: ids count from the hole nearest to the centre of each '
+        'image: this suffices for the distortion of one fluoroscope, not for the orientation of '
+        'two'
     ),
     Kind.SHADOWS_BENT: (
         'fluoroscope a: the distortion within the large shadows shifts their centres by # px '
-        '(RMS); some # px of it may be left in the correction, beyond what that claims: smaller '
-        'beads have less of it, with the square of their size'
+        '(RMS); some # px of it may remain in the correction, in addition to its standard '
+        'deviation: smaller beads reduce it, with the square of their size'
     ),
     Kind.IMAGE_ENCODING: 'the image has pixels of float64, not of # or # bits',
     Kind.IMAGE_EMPTY: 'the image is empty: every pixel has the grey value #',
     Kind.NO_POSE: 'no pose of the phantom fits the beads in the image',
     Kind.POSE_UNSURE: ('the best pose of the phantom explains only #% of the beads in the image'),
-    Kind.BEAD_ALONE: 'its neighbours are not found',
+    Kind.BEAD_ALONE: 'its neighbours were not found',
     Kind.BEAD_AWAY: '# px from its prediction',
-    Kind.BEAD_CONTRAST: 'a shadow of #% of that of a bead',
-    Kind.BEAD_DISTURBED: 'something else is beside it',
+    Kind.BEAD_CONTRAST: 'a contrast of #% of that of a bead',
+    Kind.BEAD_DISTURBED: 'another object is next to it',
     Kind.BEAD_HIDDEN: 'hidden by another bead',
-    Kind.BEAD_UNSURE: 'sigma # px, that of most is # px',
+    Kind.BEAD_UNSURE: 'sigma # px, that of most beads is # px',
     Kind.BEADS_NOT_MEASURED: (
         'the phantom is found with # beads, of which only # can be measured'
     ),
     Kind.BEAD_LOST: 'cut off, or lost while it was measured',
     Kind.EDITED_RESULT: (
-        'result/result.json: the file was changed after it was written, its figures need not '
-        'be those of the calibration: restore it, or calibrate again'
+        'result/result.json: the file was changed after it was written, its figures may not '
+        'match the calibration: restore it, or calibrate again'
     ),
     Kind.EXCHANGED_CALIBRATION: (
-        'result: the calibration file of a and result.json are of different calibrations: one '
-        'of them was exchanged; restore the files of one calibration, or calibrate again'
+        'result: the calibration file of a and result.json belong to different calibrations: one '
+        'of them was replaced; restore the files of one calibration, or calibrate again'
     ),
     Kind.CLUSTER_CHANGE: (
-        'WARN: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper '
-        'left quarter, about (#, #) px, for # s, held against the start; seen in cluster '
-        'bone, in which a bead may have moved, as no other cluster shows it'
+        'WARN: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper left '
+        'quarter, about (#, #) px, for # s, relative to the start; detected in cluster bone, '
+        'where a bead may have moved, since no other cluster shows the drift'
     ),
     Kind.IMAGE_DRIFT: (
-        'ERROR: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper '
-        'left quarter, about (#, #) px, for # s, held against the start; seen in the '
-        'epipolar residuals'
+        'ERROR: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper left '
+        'quarter, about (#, #) px, for # s, relative to the start; detected in the epipolar '
+        'residuals'
     ),
-    Kind.LEARNING: 'the start is being learned',
-    Kind.NO_DRIFT: 'no drift is seen',
-    Kind.FEW_MARKERS: 'only # of # markers are where they are said to be at first',
+    Kind.LEARNING: 'the reference is being learned',
+    Kind.NO_DRIFT: 'no drift detected',
+    Kind.FEW_MARKERS: 'only # of # markers are at their given initial positions',
     Kind.BODY_MIRRORED: (
-        'body femur: its coordinates are those of the mirrored body: they fit the points in '
-        'space to # mm, mirrored to # mm'
+        'body femur: its coordinates are mirrored: the points in space deviate from them by # '
+        'mm, and from their mirror image by # mm'
     ),
     Kind.BODY_NOT_RIGID: (
         'body femur: it is not rigid: its markers deviate from its shape by # mm (RMS; at most '
@@ -853,13 +847,13 @@ SENTENCES = {
     ),
     Kind.BODY_ON_A_LINE: (
         'body femur: its markers lie nearly on a line (condition number # per m, at most # by '
-        'ISO #): the rotation about it is weak'
+        'ISO #): the rotation about this line is poorly determined'
     ),
     Kind.BODY_UNSEEN: (
-        'body femur: no exposure shows three of its markers in space, its shape is not estimated'
+        'body femur: no exposure has three of its markers in space: its shape is not estimated'
     ),
     Kind.MARKER_LOOSE: (
-        'body femur: marker # moves against the others: its places scatter # times as much as '
+        'body femur: marker # moves relative to the others: its positions scatter by # times '
         'their standard deviations'
     ),
     Kind.MARKER_MIGRATED: (
@@ -868,30 +862,30 @@ SENTENCES = {
     ),
     Kind.MARKERS_EXCHANGED: 'body femur: markers # and # are exchanged in CT or in the images',
     Kind.CAUSE_SURE: (
-        'fluoroscope a: source and detector have moved against each other; or fluoroscope b: it '
-        'has moved against the other fluoroscope, or that one against it; the recording does not '
-        'tell which: record more motion, or calibrate with the phantom'
+        'fluoroscope a: source and detector have moved relative to each other; or fluoroscope b: '
+        'it has moved relative to the other fluoroscope, or vice versa; the recording does not '
+        'decide which: record more motion, or calibrate with the phantom'
     ),
     Kind.CHANGE_IDENTIFIED: (
-        'the direction of the change that is known worst has a standard deviation of # % of what '
-        'such a change may be: record bodies that move through more of the field of view'
+        'the least certain direction of the change has a standard deviation of # % of the size '
+        'that such a change may have: record bodies that move through more of the field of view'
     ),
     Kind.COMMON_MOTION: (
-        'all points together may have moved by # mm (RMS) in the rig frame, which no body shows'
+        'a common motion of all points by # mm (RMS) in the rig frame may be undetected'
     ),
     Kind.DISTORTION_CHANGED: 'fluoroscope a: the distortion has changed',
     Kind.FLUOROSCOPE_MOVED: (
-        'fluoroscope a: it has moved against the other fluoroscope, or that one against it'
+        'fluoroscope a: it has moved relative to the other fluoroscope, or vice versa'
     ),
-    Kind.INTERIOR_CHANGED: 'fluoroscope a: source and detector have moved against each other',
+    Kind.INTERIOR_CHANGED: 'fluoroscope a: source and detector have moved relative to each other',
     Kind.UNSEEN_DISTORTION: (
-        'a change of the distortion that no body shows may have moved points by # mm (RMS) '
-        'relative to each other where the markers were, and by more elsewhere: record more '
-        'bodies, or bodies that move through more of the field of view'
+        'an undetected change of the distortion may have moved points by # mm (RMS) relative to '
+        'each other where the markers were, and by more elsewhere: record more bodies, or bodies '
+        'that move through more of the field of view'
     ),
     Kind.UNUSED_EXPOSURES: (
         'the first half of the exposures that were not used: fluoroscope a: source and detector '
-        'have moved against each other: the rig changes while it is recorded: take another '
+        'have moved relative to each other: the rig changes while it is recorded: take another '
         'recording, or calibrate with the phantom'
     ),
     Kind.NO_MARKERS: 'no markers were seen',
@@ -901,7 +895,7 @@ SENTENCES = {
     ),
     Kind.SHORT_RECORDING: (
         'the recording is too short to detect a drift: it has # s, of which the first # s are '
-        'learned'
+        'the reference'
     ),
     Kind.WIDENED_BY_ALARM: (
         'rays miss each other by # px (RMS): until the rig is healed, the standard deviation of '

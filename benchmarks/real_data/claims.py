@@ -142,9 +142,9 @@ def _variation(
     additional = _additional(run)
     count = 2 * len(_functions(run))
     network = tested.measured.network
-    if additional.own is None:
+    if additional.grouped is None:
         return np.zeros((2 * len(rows), 0)), 0.0
-    own = additional.own.values
+    own = additional.grouped.values
     polynomials = Functions(run.measured.image_size[0], CUBIC)
     of_training = polynomials(run.measured.network.uv)
     of_tested = polynomials(network.uv[rows])

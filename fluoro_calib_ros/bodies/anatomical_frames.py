@@ -206,10 +206,12 @@ def frame_of_landmarks(
     names = recipe.landmarks
     for name in names:
         if name not in landmarks:
-            raise DataError(f'the landmark {name} is missing, there are {", ".join(names)}')
+            raise DataError(
+                f'the landmark {name} is missing; the landmarks are {", ".join(names)}'
+            )
     for name in landmarks:
         if name not in names:
-            raise DataError(f'the landmark {name} is unknown, there are {", ".join(names)}')
+            raise DataError(f'the landmark {name} is unknown, expected one of {", ".join(names)}')
     points = {name: np.array(landmarks[name], dtype=float) for name in names}
     for name, point in points.items():
         if point.shape != (3,) or not np.isfinite(point).all():
@@ -378,5 +380,7 @@ CONVENTIONS = {one.name: one for one in (*_sequences(), *_CLINICAL)}
 def convention(name: str) -> Convention:
     """Return the convention of a given name. Raises DataError for an unknown name."""
     if name not in CONVENTIONS:
-        raise DataError(f'the convention {name!r} is unknown, there are {", ".join(CONVENTIONS)}')
+        raise DataError(
+            f'the convention {name!r} is unknown, expected one of {", ".join(CONVENTIONS)}'
+        )
     return CONVENTIONS[name]

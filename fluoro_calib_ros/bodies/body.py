@@ -171,14 +171,14 @@ def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
         known = body.known
         if np.count_nonzero(known) < 3:
             raise DataError(
-                f'body {body.name}: the places of {np.count_nonzero(known)} of its '
+                f'body {body.name}: the coordinates of only {np.count_nonzero(known)} of its '
                 f'{len(body.target_id)} markers are known, a pose needs three'
             )
         no_sd = body.target_id[known & ~np.isfinite(body.sd_mm)]
         if len(no_sd):
             raise DataError(
-                f'body {body.name}: marker {no_sd[0]} has no standard deviation; it is estimated '
-                'from a recording, or given'
+                f'body {body.name}: marker {no_sd[0]} has no standard deviation: give it, or '
+                'estimate it from a recording'
             )
         out.append(body.rows(known))
     return tuple(out)

@@ -32,7 +32,10 @@ def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
     """
     known = poses.known
     if np.count_nonzero(known) < 10:
-        raise DataError(f'body {poses.body}: {np.count_nonzero(known)} poses are not filtered')
+        raise DataError(
+            f'body {poses.body}: {np.count_nonzero(known)} poses are too few for a filter, 10 '
+            'are needed'
+        )
     rate = _rate(poses)
     if not 0 < cutoff_hz < rate / 2:
         raise DataError(
@@ -66,9 +69,7 @@ def _rate(poses: BodyPoses) -> float:
     dt = np.diff(poses.stamp_ns) / 1e9
     typical = float(np.median(dt))
     if typical <= 0 or np.abs(dt - typical).max() > 0.2 * typical:
-        raise DataError(
-            'the exposures are not equally far apart, which a filter with a cutoff needs'
-        )
+        raise DataError('a filter with a cutoff needs exposures at equal time intervals')
     return 1 / typical
 
 

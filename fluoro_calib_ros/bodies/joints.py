@@ -237,7 +237,9 @@ def _check_poses(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> None:
                 f'joint {joint.name}: the poses are of {poses.body}, not of {expected}'
             )
     if not np.array_equal(proximal.number, distal.number):
-        raise DataError(f'joint {joint.name}: the poses of its bodies are of other exposures')
+        raise DataError(
+            f'joint {joint.name}: the poses of its two bodies are of different exposures'
+        )
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ class LearnedShapes:
         if orientation_id not in self.orientation_ids:
             raise DataError(
                 f'the shapes were learned with {self.orientation_ids[0]}, not with the '
-                f'orientation {orientation_id}; learn them anew while the rig is healthy'
+                f'orientation {orientation_id}; learn them again while the rig is healthy'
             )
 
 
@@ -514,7 +514,7 @@ def _place(body: Body, markers: Sequence[int] = ()) -> Place:
 def _unseen(body: Body) -> Finding:
     return Finding(
         Kind.BODY_UNSEEN,
-        'no exposure shows three of its markers in space, its shape is not estimated',
+        'no exposure has three of its markers in space: its shape is not estimated',
         place=_place(body),
         severity=Severity.WARNING,
         numbers={'markers': float(len(body.target_id))},
@@ -535,8 +535,8 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
     for scale, unit in MISTAKEN_UNITS.items():
         if abs(factor / scale - 1) < SCALE_TOLERANCE:
             cause = (
-                f'its coordinates are in {unit}, not in mm: distances in space are larger '
-                f'{factor:.4g} times'
+                f'its coordinates are in {unit}, not in mm: distances in space are {factor:.4g} '
+                'times larger'
             )
             numbers = {'factor': factor}
             return [Finding(Kind.WRONG_UNIT, cause, place=_place(body), numbers=numbers)]
@@ -551,8 +551,8 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
     limit = 4 * np.hypot(sd, np.sqrt(np.nanmedian(places.covariance[..., 0, 0])))
     if errors[1] < limit < errors[0]:
         cause = (
-            f'its coordinates are those of the mirrored body: they fit the points in space to '
-            f'{errors[0]:.2g} mm, mirrored to {errors[1]:.2g} mm'
+            'its coordinates are mirrored: the points in space deviate from them by '
+            f'{errors[0]:.2g} mm, and from their mirror image by {errors[1]:.2g} mm'
         )
         numbers = {'rms_mm': errors[0], 'rms_mirrored_mm': errors[1]}
         return [Finding(Kind.BODY_MIRRORED, cause, place=_place(body), numbers=numbers)]
@@ -573,8 +573,8 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
     if typical > limit and not len(moving) and is_stable:
         ratio = float(np.sqrt(typical))
         cause = (
-            'it is not rigid: the places of its markers scatter '
-            f'{ratio:.1f} times as much as their standard deviations'
+            f'it is not rigid: the positions of its markers scatter by {ratio:.1f} times their '
+            'standard deviations'
         )
         findings.append(
             _warning(
@@ -587,8 +587,8 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
     for row in moving:
         marker = int(body.target_id[row])
         cause = (
-            f'marker {marker} moves against the others: its places scatter '
-            f'{np.sqrt(test[row]):.1f} times as much as their standard deviations'
+            f'marker {marker} moves relative to the others: its positions scatter by '
+            f'{np.sqrt(test[row]):.1f} times their standard deviations'
         )
         findings.append(
             Finding(
@@ -663,45 +663,45 @@ def _migrated(body: Body, adjustment: _Adjustment, known: NDArray[np.bool_]) -> 
 
 
 def _against_others(
-    given: NDArray[np.float64],
-    found: NDArray[np.float64],
+    ct: NDArray[np.float64],
+    adjusted: NDArray[np.float64],
     sd: NDArray[np.float64],
     marker: int,
-    kept: Sequence[int],
+    markers: Sequence[int],
 ) -> float:
     """Return the squared deviation of a marker from CT over its variance, fitting the others."""
-    others = [k for k in kept if k != marker]
+    others = [k for k in markers if k != marker]
     weight = 1 / sd[others] ** 2
-    rotation, shift = fitted_pose(found[others], given[others], weight)
-    arm = np.concatenate([given[others], given[[marker]]]) - given[others].mean(axis=0)
+    rotation, shift = fitted_pose(adjusted[others], ct[others], weight)
+    arm = np.concatenate([ct[others], ct[[marker]]]) - ct[others].mean(axis=0)
     motion = by_pose(arm)
     normal = (np.swapaxes(motion[:-1], 1, 2) @ (motion[:-1] * weight[:, None, None])).sum(axis=0)
-    deviation = rotation @ found[marker] + shift - given[marker]
+    deviation = rotation @ adjusted[marker] + shift - ct[marker]
     covariance = sd[marker] ** 2 * np.eye(3) + motion[-1] @ np.linalg.solve(normal, motion[-1].T)
     return float(deviation @ np.linalg.solve(covariance, deviation))
 
 
 def _misfit(
-    given: NDArray[np.float64], found: NDArray[np.float64], sd: NDArray[np.float64]
+    ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> float:
     """Return the weighted squares of a fit of coordinates (k, 3) to CT, over their limit."""
-    rotation, shift = fitted_pose(found, given, 1 / sd**2)
-    deviation = (found @ rotation.T + shift - given) / sd[:, None]
-    return float(np.sum(deviation**2) / chdtri(3 * len(given) - POSE_SIZE, REJECT_TAIL))
+    rotation, shift = fitted_pose(adjusted, ct, 1 / sd**2)
+    deviation = (adjusted @ rotation.T + shift - ct) / sd[:, None]
+    return float(np.sum(deviation**2) / chdtri(3 * len(ct) - POSE_SIZE, REJECT_TAIL))
 
 
 def _exchanged(
-    given: NDArray[np.float64], found: NDArray[np.float64], sd: NDArray[np.float64]
+    ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> tuple[int, int] | None:
     """Return two markers that contradict CT, but agree with it when exchanged; or None."""
-    if _misfit(given, found, sd) <= 1:
+    if _misfit(ct, adjusted, sd) <= 1:
         return None
-    pairs = list(combinations(range(len(given)), 2))
+    pairs = list(combinations(range(len(ct)), 2))
     misfits = []
     for first, second in pairs:
-        order = np.arange(len(given))
+        order = np.arange(len(ct))
         order[[first, second]] = second, first
-        misfits.append(_misfit(given[order], found, sd))
+        misfits.append(_misfit(ct[order], adjusted, sd))
     best = int(np.argmin(misfits))
     return pairs[best] if misfits[best] <= 1 else None
 
@@ -714,7 +714,7 @@ def _stability(body: Body, condition: float, mean_error_mm: float) -> list[Findi
         cause = (
             f'its markers lie {"on" if line else "nearly on"} a line (condition number '
             f'{condition:.0f} per m, at most {MAX_CONDITION:.0f} by ISO 16087): the rotation '
-            'about it is weak'
+            'about this line is poorly determined'
         )
         findings.append(_warning(body, Kind.BODY_ON_A_LINE, cause, {'condition_per_m': condition}))
     if mean_error_mm > MAX_MEAN_ERROR_MM:

@@ -223,12 +223,12 @@ class BodyTracker:
         )
 
 
-def _filled_backwards(taken: Sequence[_Taken]) -> list[_Taken]:
+def _filled_backwards(exposures: Sequence[_Taken]) -> list[_Taken]:
     """Fill unknown constant errors of a body with those of the following exposures."""
     out: list[_Taken] = []
-    fixed = taken[-1].fixed
-    root = taken[-1].rig_root
-    for exposure in reversed(taken):
+    fixed = exposures[-1].fixed
+    root = exposures[-1].rig_root
+    for exposure in reversed(exposures):
         fixed = np.where(np.isnan(exposure.fixed), fixed, exposure.fixed)
         root = np.where(np.isnan(exposure.rig_root), root, exposure.rig_root)
         out.append(replace(exposure, fixed=fixed, rig_root=root))
@@ -361,8 +361,8 @@ class JointTracker:
     def __init__(self, joint: Joint, neutral: tuple[int, int] | None = None) -> None:
         if neutral is not None and neutral[1] - neutral[0] >= MAX_NEUTRAL:
             raise DataError(
-                f'joint {joint.name}: a neutral trial from exposure {neutral[0]} to {neutral[1]}; '
-                f'live it has at most {MAX_NEUTRAL} exposures'
+                f'joint {joint.name}: the neutral trial lasts from exposure {neutral[0]} to '
+                f'{neutral[1]}, but may have at most {MAX_NEUTRAL} exposures in live operation'
             )
         self.joint = joint
         self._neutral = neutral
@@ -394,7 +394,9 @@ class JointTracker:
             return
         collected, self._collected = self._collected, []
         if not collected:
-            self.error = DataError(f'joint {self.joint.name}: the neutral trial was not seen')
+            self.error = DataError(
+                f'joint {self.joint.name}: no exposure of the neutral trial was received'
+            )
             return
         try:
             trials = (_joined(poses) for poses in zip(*collected))

@@ -82,8 +82,8 @@ class DisplacedLayer:
             )
         x, y, z = self.shift_mm
         return (
-            f'{layer} ({len(self.target_id)} beads) is displaced as a whole against its survey: '
-            f'by {np.linalg.norm(self.shift_mm):.1f} mm ({x:.1f}, {y:.1f}, {z:.1f}) and tilted by '
+            f'{layer} ({len(self.target_id)} beads) is displaced against its survey by '
+            f'{np.linalg.norm(self.shift_mm):.1f} mm ({x:.1f}, {y:.1f}, {z:.1f}) and tilted by '
             f'{np.rad2deg(self.tilt_rad):.2f} deg'
         )
 
@@ -170,7 +170,7 @@ class _Fit:
     def improvement(self, candidate: _Candidate) -> float:
         """Return the factor by which its own motion decreases the median square of a layer."""
         rows = candidate.own
-        motions = self._motion_and_rest(rows)
+        motions = self._motions_of_parts(rows)
         after, before = (
             np.median(
                 self._squares(self._beads.misclosure[rows] - self._design[rows] @ motion, rows)
@@ -190,7 +190,7 @@ class _Fit:
                 return None
             return float(coordinate[at - 1 : at + 1].mean())
 
-        motion, motion_of_others = self._motion_and_rest(rows)
+        motion, motion_of_others = self._motions_of_parts(rows)
         relative = motion - motion_of_others
         shifts = self._design[rows] @ relative
         size = float(np.sqrt(np.mean(np.sum(shifts**2, axis=1))))
@@ -206,18 +206,18 @@ class _Fit:
             limit_mm=size * float(np.sqrt(critical / candidate.gain)),
         )
 
-    def _motion_and_rest(
-        self, own: NDArray[np.int64]
+    def _motions_of_parts(
+        self, rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the motions (6,) of the given beads and of all other beads."""
-        equations = _Equations(self._normals[own].sum(axis=0), self._rights[own].sum(axis=0))
+        equations = _Equations(self._normals[rows].sum(axis=0), self._rights[rows].sum(axis=0))
         return equations.motion, self._all.without(equations).motion
 
     def _squares(
-        self, left: NDArray[np.float64], rows: NDArray[np.int64] | slice
+        self, misclosures: NDArray[np.float64], rows: NDArray[np.int64] | slice
     ) -> NDArray[np.float64]:
-        """Return the weighted squares (k,) of remaining misclosures left (k, 3) of beads."""
-        return np.einsum('na,nab,nb->n', left, self._information[rows], left)
+        """Return the weighted squares (k,) of remaining misclosures (k, 3) of beads."""
+        return np.einsum('na,nab,nb->n', misclosures, self._information[rows], misclosures)
 
 
 def _layers(coordinate: NDArray[np.float64], sd: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -333,9 +333,9 @@ def _rejected(target_id: NDArray[np.int64]) -> Check:
     return Check(
         Kind.BEADS,
         f'most image points of bead {first_few(target_id)} are rejected, more than false matches '
-        'explain: its survey is wrong, or it is exchanged with another',
+        'explain: its survey is wrong, or it is exchanged with another bead',
         Place(target_id=tuple(target_id.tolist())),
-        'survey again, and calibrate again',
+        'survey it again, and calibrate again',
         numbers={'beads': len(target_id)},
         value=len(target_id),
         limit=0,
@@ -348,9 +348,9 @@ def _exchanged(pairs: NDArray[np.int64]) -> Check:
     return Check(
         Kind.BEADS,
         f'bead {first_few(f"{first} is exchanged with {second}" for first, second in pairs)} in '
-        "the survey: their image points lie at each other's place",
+        'the survey: the image points of each lie where the other is expected',
         Place(target_id=tuple(pairs.ravel().tolist())),
-        'exchange them in the file of the phantom, and calibrate again',
+        'exchange them in the phantom file, and calibrate again',
         numbers={'beads': pairs.size},
         value=pairs.size,
         limit=0,
@@ -384,8 +384,8 @@ def compare_with_survey(
     named = beads.target_id[[worst]]
     numbers: dict[str, float] = {'beads': count}
     cause = (
-        f'bead {beads.target_id[worst]} lies {size[worst]:.2f} mm from its survey, the worst of '
-        f'{count}'
+        f'bead {beads.target_id[worst]} lies {size[worst]:.2f} mm from its survey, the largest '
+        f'deviation of {count}'
     )
     value = size[worst]
     highest = value * np.sqrt(limit / max(square[worst], 1e-9))
@@ -422,8 +422,8 @@ def _not_made(kind: Kind, count: int) -> Check:
     """Return a check that could not be made because too few beads are seen."""
     return Check(
         kind,
-        f'check {kind.value} could not be made, only {count} beads are seen often enough to be '
-        'found from the images alone',
+        f'check {kind.value} could not be performed, only {count} beads are seen often enough to '
+        'be located from the images alone',
         advice='take more exposures',
         numbers={'beads': count},
     )
@@ -441,17 +441,17 @@ def _check_distances(beads: Beads, has_trend: bool) -> Check:
     if len(beads.target_id) < MIN_BEADS:
         return Check(
             Kind.DISTANCES,
-            'check distances could not be made, too few beads agree with their survey',
+            'check distances could not be performed, too few beads agree with their survey',
         )
     measured = distances(beads)
     by_chance = float(np.sqrt(chdtri(measured.freedom, FALSE_ALARM) / measured.freedom))
     return Check(
         Kind.DISTANCES,
-        f'distances between beads differ from the survey by {measured.rmse_mm:.3f} mm, '
-        f'{measured.expected_mm:.3f} mm are expected (scale {1 + measured.scale:.6f}, '
-        f'sd {measured.scale_sd:.6f})',
-        advice='the survey is less precise than its sd says, or the calibration is wrong if other '
-        'checks fail too; survey the phantom again, or give a larger sd',
+        f'distances between beads differ from the survey by {measured.rmse_mm:.3f} mm, where '
+        f'{measured.expected_mm:.3f} mm is expected (scale {1 + measured.scale:.6f}, sd '
+        f'{measured.scale_sd:.6f})',
+        advice='the survey is less precise than its sd states, or, if other checks fail too, the '
+        'calibration is wrong; survey the phantom again, or give a larger sd',
         numbers={'scale': 1 + measured.scale, 'scale_sd': measured.scale_sd},
         value=measured.rmse_mm,
         limit=max(DISTANCES_LIMIT, by_chance) * measured.expected_mm,

@@ -201,9 +201,9 @@ class Evidence:
         request = replace(self.request, options=replace(self.request.options, interior_sd=None))
         return replace(self, request=request).calibrate(self.part(names, lambda i: True))
 
-    def _has_lost_points(self, found: Calibrations, frames: Frames) -> bool:
+    def _has_lost_points(self, calibrations: Calibrations, frames: Frames) -> bool:
         """Return whether a part rejects clearly more image points than the whole."""
-        for name, calibration in found.items():
+        for name, calibration in calibrations.items():
             share = _share_of_inliers(calibration, frames[name])
             share_of_whole = _share_of_inliers(self.calibrations[name], self.frames[name])
             if share < share_of_whole - MAX_LOST:

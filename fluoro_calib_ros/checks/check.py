@@ -122,7 +122,7 @@ def too_little_data(kind: Kind, fluoroscope: str, reason: str, count: int) -> Ch
     """Return a check that could not be made, for a reason in `count` exposures."""
     return Check(
         kind,
-        f'check {kind.value} could not be made, {reason}',
+        f'check {kind.value} could not be performed, {reason}',
         Place((fluoroscope,)),
         more_exposures(count),
         numbers={'exposures': count},

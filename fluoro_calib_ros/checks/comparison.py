@@ -195,9 +195,7 @@ def compare_calibrations(
     fields = at_common_angle(uv, first, second)
     inside = ~(fields[0].outside | fields[1].outside)
     if inside.sum() < MIN_PIXELS:
-        raise DataError(
-            f'fluoroscope {name}: the calibrated areas have hardly any image in common'
-        )
+        raise DataError(f'fluoroscope {name}: the calibrated areas hardly overlap')
     uv = uv[inside]
     parts = [_part(field, inside) for field in fields]
     compared = _difference(uv, (first.interior, second.interior), parts)

@@ -103,7 +103,7 @@ class DriftOptions:
     )
     learn_s: float = option(
         10.0,
-        'length of the start, the reference of all that follows',
+        'length of the start of the stream, which is the reference for the rest',
         minimum=1.0,
         maximum=3600.0,
         unit='s',
@@ -118,7 +118,7 @@ class DriftOptions:
     cells: int = option(4, 'cells across an image, an even number', minimum=2, maximum=16)
     tolerance_px: float = option(
         0.15,
-        'drift that does not matter, part of every dead band',
+        'negligible drift, part of every dead band',
         minimum=0.0,
         maximum=100.0,
         unit='px',

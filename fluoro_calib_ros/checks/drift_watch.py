@@ -291,9 +291,9 @@ class DriftWatch:
         if not self._observations:
             finding = Finding(Kind.NO_MARKERS, 'no markers were seen', severity=OK)
         elif is_learning:
-            finding = Finding(Kind.LEARNING, 'the start is being learned', severity=OK)
+            finding = Finding(Kind.LEARNING, 'the reference is being learned', severity=OK)
         else:
-            finding = Finding(Kind.NO_DRIFT, 'no drift is seen', severity=OK)
+            finding = Finding(Kind.NO_DRIFT, 'no drift detected', severity=OK)
         return DriftState(finding, peak, warn, error, self._observations, learning=is_learning)
 
     def _drift_state(self, level: Severity, estimate: DriftEstimate, peak: float) -> DriftState:
@@ -333,14 +333,13 @@ def _alarm(level: Severity, estimate: DriftEstimate, place: str, since_s: float)
     if seen_in == EPIPOLAR:
         seen_in = 'the epipolar residuals'
     elif not estimate.confirmed:
-        seen_in += ', in which a bead may have moved, as no other cluster shows it'
+        seen_in += ', where a bead may have moved, since no other cluster shows the drift'
     return Finding(
         Kind.IMAGE_DRIFT if estimate.confirmed else Kind.CLUSTER_CHANGE,
         f'{LEVEL_NAMES[level].upper()}: the image of fluoroscope '
-        f'{" or ".join(estimate.fluoroscopes)} has drifted by '
-        f'{size:.2f} px (sd {estimate.sd:.2f}) towards '
-        f'({direction[0]:.1f}, {direction[1]:.1f}), {place}, for {since_s:.1f} s, '
-        f'held against the {estimate.against}; seen in {seen_in}',
+        f'{" or ".join(estimate.fluoroscopes)} has drifted by {size:.2f} px (sd '
+        f'{estimate.sd:.2f}) towards ({direction[0]:.1f}, {direction[1]:.1f}), {place}, for '
+        f'{since_s:.1f} s, relative to the {estimate.against}; detected in {seen_in}',
         Place(estimate.fluoroscopes, name=''),
         severity=level,
         numbers={'size_px': size, 'sd_px': estimate.sd, 'since_s': since_s},

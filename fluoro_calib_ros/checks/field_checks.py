@@ -51,7 +51,7 @@ def _precision(evidence: Evidence, name: str) -> Check:
         if evidence.request.options.model_name != AUTO:
             advice = f'choose another model (--model auto), or {advice}'
     ratio = trends.claimed_sd / noise if noise > 0 else np.inf
-    comparison = 'residuals that its lack of fit explains: the image noise is not known'
+    comparison = 'residuals explained by its lack of fit: the image noise is unknown'
     if np.isfinite(ratio):
         growth = 100 * (np.sqrt(1 + ratio**2) - 1)
         comparison = f'an image noise of {noise:.3f} px: it makes the errors of corrected points '
@@ -96,10 +96,10 @@ def _too_few_points(evidence: Evidence, name: str) -> Check:
     reason = f'fewer than {MIN_VARYING_EXPOSURES} exposures have {MIN_POINTS} image points'
     check = too_little_data(Kind.VARIATION, name, reason, count)
     if len(evidence.phantom.target_id) < MIN_POINTS:
-        return replace(check, advice=f'take a phantom of {MIN_POINTS} beads or more')
+        return replace(check, advice=f'use a phantom with {MIN_POINTS} beads or more')
     if count < MIN_VARYING_EXPOSURES:
         return check
-    return replace(check, advice='take exposures that show more beads each')
+    return replace(check, advice='take exposures that show more beads')
 
 
 def _variation(evidence: Evidence, name: str) -> Check:
@@ -112,10 +112,9 @@ def _variation(evidence: Evidence, name: str) -> Check:
         f'the distortion differs between exposures by {variation.size_px:.3f} px '
         f'(chi2/dof {variation.chi2_per_dof:.2f}, constant up to {VARYING:.2f})',
         Place((name,)),
-        f'{_angles(evidence, name)}, a lens that was focused or zoomed, a source or detector '
-        'that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
-        f'{more_exposures(count)} at the angle and setting that are used, or calibrate each'
-        + _how_to_give_angles(evidence, name),
+        f'{_angles(evidence, name)}, a refocused or zoomed lens, an unstable source or detector, '
+        f'or a phantom that moved, was bent or has a wrong survey; {more_exposures(count)} at '
+        'the angle and setting in use, or calibrate each' + _how_to_give_angles(evidence, name),
         numbers={
             'chi2_per_dof': variation.chi2_per_dof,
             'noise_px': variation.noise_px,
@@ -134,7 +133,7 @@ def _angles(evidence: Evidence, name: str) -> str:
         return 'a C-arm at another angle'
     if np.ptp(angles) < np.deg2rad(2 * np.pi):  # as degrees, less than a full turn in radians
         return 'angles of the C-arm that are in radians, not in degrees'
-    return 'angles of the C-arm that are not those of these exposures'
+    return 'angles of the C-arm that belong to other exposures'
 
 
 def _how_to_give_angles(evidence: Evidence, name: str) -> str:
@@ -171,7 +170,7 @@ def _agreement(
 ) -> Check:
     compared = difference(one, other)
     if compared is None:
-        reason = 'two halves of the exposures cover too little of the image in common'
+        reason = 'the areas of the image that two halves of the exposures cover overlap too little'
         return too_little_data(Kind.HALVES, name, reason, count)
     expected = float(np.sqrt(np.mean(compared.sd**2)))
     return Check(
@@ -180,8 +179,8 @@ def _agreement(
         f'{compared.rms_px:.3f} px, where {expected:.3f} px is predicted, most at '
         f'{describe_place(compared.worst, one.image_size)}',
         Place.at(name, compared.worst),
-        f'{more_exposures(count)} that show beads there, and see that phantom and fluoroscope '
-        'stand still in each',
+        f'{more_exposures(count)} that show beads there, and keep phantom and fluoroscope still '
+        'during each',
         numbers={'difference_px': compared.rms_px, 'predicted_px': expected},
         value=compared.normalised,
         limit=LIMIT,
@@ -223,7 +222,7 @@ def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
 def _advice(requested: str, model: CorrectionModel, count: int) -> str:
     """Return the advice on a trend; requested: model option, model: model in use."""
     if not model.corrects:
-        return 'calibrate with a correction model (--model auto), it was made without one'
+        return 'calibrate with a correction model (--model auto), there is none'
     alternative = '' if requested == 'auto' else ', or choose another model (--model auto)'
     return (
         f'the correction model {model.kind} does not follow the distortion there; '
@@ -242,7 +241,7 @@ def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     )
     return Check(
         Kind.WORST_AREA,
-        f'the worst mean residual of an area, {trend.cell_size:.3f} px, is at '
+        f'the largest mean residual of an area, {trend.cell_size:.3f} px, is at '
         f'{describe_place(trend.place, calibration.image_size)}',
         Place.at(name, trend.place),
         f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose '
@@ -258,8 +257,8 @@ def _rejected_area(evidence: Evidence, name: str, rejected: RejectedTrend) -> Ch
     size = evidence.calibrations[name].image_size
     return Check(
         Kind.WORST_AREA,
-        f'{rejected.points} image points of different exposures were '
-        f'rejected as false matches, but agree: {rejected.size:.3f} px on average at '
+        f'{rejected.points} image points of different exposures were rejected as false matches, '
+        f'but agree with each other: {rejected.size:.3f} px on average at '
         f'{describe_place(rejected.place, size)}',
         Place.at(name, rejected.place),
         'the correction model does not follow the distortion there; '

@@ -102,10 +102,10 @@ def corrected_already(
     )
     return Finding(
         Kind.CORRECTED_ALREADY,
-        f'the image points are corrected already, their RMSE is {rmse:.2f} px with the correction '
-        f'and {rmse_without:.2f} px without',
+        f'the image points are already corrected, their RMSE is {rmse:.2f} px with the '
+        f'correction and {rmse_without:.2f} px without',
         Place(tuple(names)),
-        'give the observed ones',
+        'give the observed image points',
         numbers={'rmse_px': rmse, 'rmse_without_px': rmse_without},
     )
 
@@ -119,10 +119,10 @@ def poor_fits(
         after = rms(result.fluoroscopes[name].rmse_after)
         before = rms(result.fluoroscopes[name].rmse_before)
         kind = Kind.POOR_CALIBRATION_FIT
-        reason = 'the image has changed, or the calibration is that of another fluoroscope'
+        reason = 'the image has changed, or the calibration is of another fluoroscope'
         if before < CORRECTED * after:
             kind = Kind.CORRECTED_ALREADY
-            reason = 'the image points seem to be corrected already'
+            reason = 'the image points seem to be already corrected'
         out.append(
             Finding(
                 kind,
@@ -253,7 +253,7 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
     limit = 1 + MARGIN * np.sqrt(RECOMMENDED_EXPOSURES / count)
     held_out = Check(
         Kind.HELD_OUT,
-        f'residuals of exposures held out are {value:.3f} px, {expected:.3f} px are expected',
+        f'residuals of held-out exposures are {value:.3f} px, where {expected:.3f} px is expected',
         Place((name,)),
         f'the calibration does not hold for exposures it has not used; {more_exposures(count)} in '
         'other poses',
@@ -270,10 +270,10 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
     worst = int(np.argmax(ratio / limits))
     exposures = Check(
         Kind.EXPOSURES,
-        f'exposure {number[worst]} fits the calibration of the others worst, '
-        f'with {ratio[worst]:.2f} times the expected residuals',
+        f'exposure {number[worst]} deviates most from the calibration of the others, its '
+        f'residuals are {ratio[worst]:.2f} times the expected ones',
         Place((name,), (int(number[worst]),), name=f'fluoroscope {name}'),
-        'inspect it (phantom or fluoroscope moved, wrong ids), leave it out by a decision in '
+        'inspect it (phantom or fluoroscope moved, wrong ids), exclude it by a decision in '
         'doubtful.csv and calibrate again',
         value=ratio[worst],
         limit=limits[worst],
@@ -285,18 +285,19 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
     return [check.after_trend(trends.is_significant) for check in (held_out, exposures)]
 
 
-def _rejected_exposure(name: str, found: RejectedExposure) -> Check:
+def _rejected_exposure(name: str, rejected: RejectedExposure) -> Check:
     """Return the check that fails because rejected image points of an exposure agree."""
     return Check(
         Kind.EXPOSURES,
-        f'{found.points} of {found.of} image points of exposure {found.number} are rejected as '
-        'false matches, but agree with their neighbours',
-        Place((name,), (found.number,), name=f'fluoroscope {name}'),
-        'the calibration does not hold in this exposure: inspect it (phantom, lens or fluoroscope '
-        'moved, wrong ids), leave it out by a decision in doubtful.csv and calibrate again',
-        numbers={'rejected_points': found.points, 'points': found.of},
-        value=found.agreement,
-        limit=found.limit,
+        f'{rejected.points} of {rejected.of} image points of exposure {rejected.number} are '
+        'rejected as false matches, but agree with their neighbours',
+        Place((name,), (rejected.number,), name=f'fluoroscope {name}'),
+        'the calibration does not hold in this exposure: inspect it (phantom, lens or '
+        'fluoroscope moved, wrong ids), exclude it by a decision in doubtful.csv and calibrate '
+        'again',
+        numbers={'rejected_points': rejected.points, 'points': rejected.of},
+        value=rejected.agreement,
+        limit=rejected.limit,
         unit='sd of chance',
     )
 

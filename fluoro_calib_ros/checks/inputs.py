@@ -58,7 +58,7 @@ Relabel = Callable[[NDArray[np.int64], Phantom], NDArray[np.int64]]
 _PHANTOM = Place(name='phantom')
 _MIRRORED = Finding(
     Kind.IMAGE_MIRRORED,
-    'the image is mirrored: v must run down and u to the right, and neither they nor the axes of '
+    'the image is mirrored: u must run to the right and v down, and neither u and v nor axes of '
     'the phantom may be interchanged',
 )
 _OTHER_PHANTOM = Finding(
@@ -66,7 +66,7 @@ _OTHER_PHANTOM = Finding(
     'the image points do not fit the phantom: this is another phantom, or the target ids are '
     'wrong',
 )
-_RIGHT_IDS = 'with the right ones the image points fit the phantom'
+_RIGHT_IDS = 'with the correct ids the image points fit the phantom'
 # Common confusions of ids, and functions that return the right ids.
 CONFUSIONS: tuple[tuple[Finding, Relabel], ...] = (
     (
@@ -146,14 +146,14 @@ def validate_names(names: Iterable[str]) -> None:
         other = seen.setdefault(name.lower(), name)
         if other != name:
             raise DataError(
-                f'fluoroscopes {other} and {name} differ in capital letters only',
+                f'fluoroscopes {other} and {name} differ only in case',
                 kind=Kind.DUPLICATE_NAME,
                 place=Place((other, name), name=''),
-                advice='this is one fluoroscope, or name them otherwise',
+                advice='use one name for one fluoroscope, or rename one of two',
             )
 
 
-def why_excluded(frame: Frame, phantom: Phantom) -> Finding | None:
+def exclusion_reason(frame: Frame, phantom: Phantom) -> Finding | None:
     """Return why a misfitting exposure is excluded, or None if the cause is not found."""
     cause = _cause(frame, phantom)
     return None if cause is None or cause.kind is Kind.OTHER_PHANTOM else cause
@@ -190,8 +190,8 @@ def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
         out.append(
             Finding(
                 Kind.REMOTE_TARGETS,
-                f'target {first_few(seen_id[remote])} is {distance[remote].max():.0f} mm from the '
-                f'middle of the others, most of which are within {extent:.0f} mm',
+                f'target {first_few(seen_id[remote])} is {distance[remote].max():.0f} mm from '
+                f'the centre of the others, most of which are within {extent:.0f} mm',
                 replace(_PHANTOM, target_id=tuple(seen_id[remote].tolist())),
                 'a wrong coordinate, another unit, or a fill value for targets that are not '
                 'surveyed',
@@ -319,22 +319,22 @@ def find_wrong_orientation(
             out.append(
                 Finding(
                     Kind.FLUOROSCOPES_INTERCHANGED,
-                    f'its image points fit the known orientation of fluoroscope {fits[0]}, the '
+                    f'its image points fit the known orientation of fluoroscope {fits[0]}: the '
                     'fluoroscopes are interchanged',
                     Place((name, fits[0]), name=f'fluoroscope {name}'),
                 )
             )
         elif median > limit:
             all_behind = 'most targets would lie behind the source'
-            all_far = f'image points are {median:.0f} px off in the median'
+            all_far = f'the median error of the image points is {median:.0f} px'
             out.append(
                 Finding(
                     Kind.WRONG_KNOWN_ORIENTATION,
-                    f'the known orientation does not fit, '
+                    'the known orientation does not fit: '
                     f'{all_far if np.isfinite(median) else all_behind}',
                     Place((name,)),
-                    'check the unit and the frame of the lab, that R and t lead from the lab to '
-                    'the sensor, and that v runs down',
+                    'check the unit and the frame of the lab, that R and t transform from the '
+                    'lab to the sensor, and that v runs down',
                     numbers={'residual_px': median},
                 )
             )
@@ -401,9 +401,8 @@ def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
         return Finding(
             Kind.SOURCE_TOO_NEAR,
             f'the source would be {distance_mm:.3g} mm from a phantom that is {extent:.3g} mm '
-            'large, nearer than that of a fluoroscope',
-            advice='the principal distance is wrong, or the images are those of a wide-angle '
-            'camera',
+            'large, closer than in a fluoroscope',
+            advice='the principal distance is wrong, or the images are from a wide-angle camera',
             numbers=numbers,
         )
     units = [unit for mm, unit in MISTAKEN_UNITS.items() if low <= distance_mm * mm <= high]
@@ -539,8 +538,8 @@ def _large_residuals(figures: FluoroscopeResult, frames: Sequence[Frame]) -> Fin
     return Finding(
         Kind.LARGE_RESIDUALS,
         f'the residuals are too large: RMSE {rmse:.1f} px after the correction, at most '
-        f'{limit:.1f} px are plausible; false matches, another phantom, or the distortion changed '
-        'between the exposures',
+        f'{limit:.1f} px are plausible; possible causes: false matches, another phantom, or a '
+        'change of the distortion between the exposures',
         numbers={'rmse_px': rmse, 'limit_px': limit},
     )
 
@@ -588,7 +587,7 @@ def _wrong_interior(
         return None
     return Finding(
         Kind.PRINCIPAL_POINT_OFF,
-        f'the principal point ({xp:.0f}, {yp:.0f}) is {offset:.0f} px from the middle of the '
+        f'the principal point ({xp:.0f}, {yp:.0f}) is {offset:.0f} px from the centre of the '
         'image',
         advice='wrong target ids, a wrong image size, or another phantom',
         numbers={'offset_px': offset},
@@ -605,7 +604,7 @@ def _wrong_given_distance(calibration: FluoroscopeCalibration) -> Finding | None
         Kind.WRONG_PRINCIPAL_DISTANCE,
         f'the principal distance is fixed at {given_px:.0f} px, but the exposures show about '
         f'{shown_px:.0f} px',
-        advice='it has to be given in pixels',
+        advice='give it in pixels',
         numbers={'given_px': given_px, 'shown_px': shown_px},
     )
 

@@ -212,10 +212,10 @@ def _whole_group(
 def _finding(ids: NDArray[np.int64], factor: float) -> Finding:
     """Return the finding on targets that fit after multiplication by a factor."""
     unit = MISTAKEN_UNITS.get(factor)
-    remark = f' ({unit} in place of mm)' if unit else ''
+    remark = f' ({unit} instead of mm)' if unit else ''
     return Finding(
         Kind.MIXED_UNITS,
-        f'{len(ids)} targets, {first_few(ids)}, are in another unit than the others',
+        f'{len(ids)} targets, {first_few(ids)}, are in a different unit from the others',
         Place(target_id=tuple(ids.tolist()), name='phantom'),
         f'they fit when their coordinates are multiplied by {factor:.4g}{remark}',
         numbers={'factor': factor},

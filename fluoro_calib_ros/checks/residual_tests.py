@@ -454,12 +454,12 @@ def doubtful_observations(
     return out
 
 
-def _of_finding(found: Finding) -> Iterator[Doubtful]:
-    place = found.place
+def _of_finding(finding: Finding) -> Iterator[Doubtful]:
+    place = finding.place
     for name in place.fluoroscopes:
         for exposure in place.exposures:
             for target in place.target_id or (None,):
-                yield Doubtful(name, exposure, exposure, target, found.cause)
+                yield Doubtful(name, exposure, exposure, target, finding.cause)
 
 
 def _outlying_points(result: CalibrationResult, table: ResidualTable) -> Iterator[Doubtful]:

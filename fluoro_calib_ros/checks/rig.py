@@ -138,10 +138,9 @@ def contradiction(
     turn_deg = float(np.rad2deg(off_rad))
     return Finding(
         Kind.PAIRS_CONTRADICT,
-        f'the exposures of fluoroscopes {a} and {b} contradict each other: their relative '
-        f'orientation differs by {off_mm:.0f} mm and {turn_deg:.1f} degrees between '
-        'them; frames with the same number are not of the same exposure, or a fluoroscope was '
-        'moved',
+        f'the exposures of fluoroscopes {a} and {b} contradict each other: the relative '
+        f'orientation differs by {off_mm:.0f} mm and {turn_deg:.1f} degrees; frames with the '
+        'same number are from different exposures, or a fluoroscope was moved',
         Place(names, name=NOT_ORIENTED),
         severity=Severity.WARNING,
         numbers={
@@ -179,10 +178,10 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
         excluded = tuple(scatter.exposures[~scatter.used].tolist())
         finding = Finding(
             Kind.PAIRS_EXCLUDED,
-            f'not from exposure {", ".join(map(str, excluded))}, in which fluoroscopes {a} and '
-            f'{b} stand otherwise to each other by {_size(scatter.off_px[~scatter.used])}',
+            f'without exposure {", ".join(map(str, excluded))}, where the relative orientation '
+            f'of fluoroscopes {a} and {b} differs by {_size(scatter.off_px[~scatter.used])}',
             place=replace(place, exposures=excluded),
-            advice='the frames are not of one exposure, or the phantom moved between them',
+            advice='the frames are from different exposures, or the phantom moved between them',
             severity=Severity.WARNING,
             numbers={'off_px': float(np.max(scatter.off_px[~scatter.used]))},
         )
@@ -193,8 +192,8 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
             f'the relative orientation of fluoroscopes {a} and {b} changes with the angle of the '
             f'C-arm, by {scatter.angle_px:.1f} px',
             place=place,
-            advice='it is that of the mean angle; orient the rig from a capture at the angle '
-            'that is used',
+            advice='it holds for the mean angle; orient the rig from a capture at the angle in '
+            'use',
             severity=Severity.WARNING,
             numbers={'angle_px': float(scatter.angle_px)},
         )
@@ -229,9 +228,9 @@ def _cause(scatter: PairScatter) -> tuple[Kind, tuple[int, ...], str]:
     remaining = [squares for squares, _ in fits]
     if count < MIN_PAIRS_MOVED or min(remaining) > MOVED_SHARE * _squares(place, columns)[0]:
         cause = (
-            'frames with the same number are not of the same exposure, the phantom moved between '
-            'them, the fluoroscopes or their images do not stand still, or the corrections do not '
-            'hold in all of them'
+            'frames with the same number are from different exposures, the phantom moved between '
+            'them, a fluoroscope or its image is unstable, or the corrections do not hold in all '
+            'of them'
         )
         return Kind.PAIRS_CONTRADICT, (), cause
     best = int(np.argmin(remaining))
@@ -334,12 +333,12 @@ def rig_findings(
     )
 
 
-def check_rig(found: RigFindings) -> list[Check]:
+def check_rig(findings: RigFindings) -> list[Check]:
     """Return a check for every fluoroscope of a rig except the first."""
-    if not found.fluoroscopes:
+    if not findings.fluoroscopes:
         return []
-    if not found.scatter:
-        (doubt,) = found.doubts
+    if not findings.scatter:
+        (doubt,) = findings.doubts
         contradicts = doubt.kind is Kind.PAIRS_CONTRADICT
         return [
             Check(
@@ -353,15 +352,15 @@ def check_rig(found: RigFindings) -> list[Check]:
                 unit='largest of a rig' if contradicts else '',
             )
         ]
-    return [_check(found, pairs) for pairs in found.scatter]
+    return [_check(findings, pairs) for pairs in findings.scatter]
 
 
-def _check(found: RigFindings, pairs: PairScatter) -> Check:
+def _check(findings: RigFindings, pairs: PairScatter) -> Check:
     """Return the check of the scatter of the pairs of two fluoroscopes."""
     a, b = pairs.fluoroscopes
     off_px = float(np.median(pairs.off_px[pairs.used]))
     predicted = off_px / max(pairs.unexplained, 1.0)
-    doubts = [doubt for doubt in found.doubts if doubt.place.fluoroscopes == (a, b)]
+    doubts = [doubt for doubt in findings.doubts if doubt.place.fluoroscopes == (a, b)]
     doubts = [doubt for doubt in doubts if doubt.kind in (Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED)]
     cause = (
         f'the relative orientation of fluoroscopes {a} and {b} differs between the exposures by '
@@ -372,9 +371,9 @@ def _check(found: RigFindings, pairs: PairScatter) -> Check:
         doubts[0].cause if doubts else cause,
         doubts[0].place if doubts else Place((a, b), name=ORIENTED),
         '' if doubts and doubts[0].kind is Kind.RIG_MOVED else CAPTURE,  # its cause contains it
-        numbers={'ratio': float(pairs.unexplained), 'noise_px': found.noise_px},
+        numbers={'ratio': float(pairs.unexplained), 'noise_px': findings.noise_px},
         value=off_px,
-        limit=max(found.noise_px, DOUBTFUL_GROWTH * predicted),
+        limit=max(findings.noise_px, DOUBTFUL_GROWTH * predicted),
         unit='px',
     )
 
@@ -394,9 +393,9 @@ def _trusted(frames: Frames, pairs: PairScatter, noise_px: float) -> Finding | N
         reason = f'by their stamps the image moves by {moved_px:.1f} px between them'
     return Finding(
         Kind.TAKEN_ON_TRUST,
-        f'the orientation of fluoroscopes {a} and {b} takes on trust that frames of one number '
-        f'are of one exposure, or that the phantom stands still ({reason}): a delay that is '
-        'always the same looks like another orientation where the phantom turns steadily',
+        f'the orientation of fluoroscopes {a} and {b} assumes that frames with the same number '
+        f'are simultaneous, or that the phantom stands still ({reason}): if the phantom turns '
+        'steadily, a constant delay looks like another orientation',
         Place((a, b), name=''),
         severity=Severity.NOTE if moved_px is None else Severity.WARNING,
         numbers={} if moved_px is None else {'moved_px': moved_px},

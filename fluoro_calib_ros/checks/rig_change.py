@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..healing.sizes import Told, parts_of_interior, parts_of_knock
+from ..healing.sizes import ChangeStatistics, parts_of_interior, parts_of_knock
 from ..photogrammetry.noise import CERTAIN, NORMAL_MEDIAN
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
@@ -84,21 +84,21 @@ class RigChange:
         number: int,
         target_id: NDArray[np.integer],
         uv: tuple[NDArray[np.float64], NDArray[np.float64]],
-        found: EpipolarResiduals,
+        residuals: EpipolarResiduals,
         noise: NDArray[np.float64],
     ) -> None:
         """Add the image points uv (n, 2) of a pair in an exposure.
 
         noise (n,): variances of the residuals due to noise alone.
         """
-        is_finite = np.isfinite(found.residual)
+        is_finite = np.isfinite(residuals.residual)
         columns = (
             target_id,
             *uv,
-            found.residual,
+            residuals.residual,
             noise,
-            found.sd_total**2 - noise,
-            np.abs(found.residual) > CERTAIN * found.sd_total,
+            residuals.sd_total**2 - noise,
+            np.abs(residuals.residual) > CERTAIN * residuals.sd_total,
         )
         self._open[number].append(tuple(column[is_finite] for column in columns))
 
@@ -161,7 +161,7 @@ class RigChange:
         factor, weight = _weights(design, rays.residual, variance)
         normal = rays.by_rig.T @ (rays.by_rig * weight[:, None])
         right = -rays.by_rig.T @ (weight * rays.residual)
-        statistics = Told(normal, right)
+        statistics = ChangeStatistics(normal, right)
         moments = np.zeros((len(self._hypotheses), len(SIZES), *normal.shape))
         evidence = []
         for moments_of_sizes, sd in zip(moments, self._hypotheses):

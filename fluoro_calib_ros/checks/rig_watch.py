@@ -323,7 +323,7 @@ class RecordingDriftWatch(RigDriftWatch):
             )
         min_s = MIN_BLOCKS_TO_ALARM * self.options.block_s
         if watched >= min_s:
-            cause = f'no drift is seen in {watched:.1f} s'
+            cause = f'no drift detected in {watched:.1f} s'
             finding = Finding(Kind.NO_DRIFT, cause, severity=OK, numbers={'watched_s': watched})
             return DriftVerdict(finding, level_at_end=level_at_end, watched_s=watched)
         learn_s = self.options.learn_s
@@ -336,7 +336,7 @@ class RecordingDriftWatch(RigDriftWatch):
             finding = Finding(
                 Kind.SHORT_RECORDING,
                 f'the recording is too short to detect a drift: it has {length_s:.1f} s, of '
-                f'which the first {learn_s:g} s are learned',
+                f'which the first {learn_s:g} s are the reference',
                 severity=WARN,
                 numbers={'length_s': length_s, 'learn_s': learn_s},
             )
@@ -345,7 +345,7 @@ class RecordingDriftWatch(RigDriftWatch):
     def _drift(self, worst: DriftState) -> Finding:
         """Return the finding on the recording for the drift of the worst state."""
         found_s = (self._found_ns - (self._first_ns or 0)) / 1e9
-        ended = '; it was gone at the end' if self.state.level == OK else ''
+        ended = '; no longer detected at the end' if self.state.level == OK else ''
         statement = 'no longer holds' if worst.level == ERROR else 'may no longer hold'
-        cause = f'{worst.finding.cause}; found {found_s:.1f} s after the beginning{ended}'
+        cause = f'{worst.finding.cause}; alarm {found_s:.1f} s after the start{ended}'
         return replace(worst.finding, cause=cause, advice=f'the calibration {statement}')

@@ -201,8 +201,8 @@ def check_shape(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     return [
         Check(
             Kind.SHAPE,
-            f'the survey of the phantom is strained against the images by {1e2 * size:+.3f} % '
-            f'along {_text(direction)}, which displaces beads by {value:.3f} mm (RMS)',
+            f'the survey of the phantom is strained relative to the images by {1e2 * size:+.3f} '
+            f'% along {_text(direction)}, which displaces beads by {value:.3f} mm (RMS)',
             advice='survey the phantom again, or give a larger sd, and calibrate again',
             numbers={
                 'strain': size,
@@ -231,9 +231,10 @@ def trusted_shape(checks: Sequence[Check]) -> list[Finding]:
             out.append(
                 Finding(
                     Kind.TAKEN_ON_TRUST,
-                    f'the shape of the phantom is taken on trust: a strain of {1e2 * size:.2f} % '
-                    f'along {direction} would not be seen in these exposures, and make the errors '
-                    f'of beads {np.sqrt(1 + hidden_nse):.1f} times their standard deviations',
+                    'the exposures do not verify the shape of the phantom: a strain of '
+                    f'{1e2 * size:.2f} % along {direction} would be undetected, and would make '
+                    f'the errors of beads {np.sqrt(1 + hidden_nse):.1f} times their standard '
+                    'deviations',
                     Place(name=''),
                     'tilt the phantom about more than one axis',
                     severity=Severity.NOTE,

@@ -75,7 +75,7 @@ def displaced(beads: SurveyedBeads) -> Finding | None:
     largest = float(beads.off_mm[order[0]])
     return Finding(
         Kind.BEADS,
-        f'{len(ids)} beads lie further from the given coordinates than their sd says, by up to '
+        f'{len(ids)} beads lie further from the given coordinates than their sd allows, by up to '
         f'{largest:.2f} mm: {first_few(ids)}',
         Place(target_id=tuple(ids.tolist()), name=''),
         severity=Severity.NOTE,
@@ -101,7 +101,7 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
     common_ids = np.intersect1d(one.target_id, other.target_id)
     if len(common_ids) < MIN_BEADS:
         return halves_not_compared(
-            f'two halves of the exposures have {len(common_ids)} beads in common'
+            f'two halves of the exposures have only {len(common_ids)} beads in common'
         )
     one, other = (
         beads.without(np.setdiff1d(beads.target_id, common_ids)) for beads in (one, other)
@@ -122,7 +122,7 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
         Kind.HALVES,
         f'two halves of the exposures give coordinates that differ by {rms:.3f} mm, where '
         f'{expected:.3f} mm is predicted',
-        advice='see that phantom and fluoroscope stand still in each exposure, and take more',
+        advice='keep phantom and fluoroscope still during each exposure, and take more exposures',
         numbers={'difference_mm': rms, 'predicted_mm': expected, 'beads': len(common_ids)},
         value=square / freedom,
         limit=max(HALVES_LIMIT, float(chdtri(freedom, CONTRADICTION)) / freedom),
@@ -134,7 +134,7 @@ def halves_not_compared(reason: str) -> Check:
     """Return the check 'halves' that could not be made, with a reason."""
     return Check(
         Kind.HALVES,
-        f'check halves could not be made, {reason}',
+        f'check halves could not be performed, {reason}',
         advice='take more exposures',
     )
 
@@ -160,7 +160,7 @@ def _check_intersection(beads: SurveyedBeads) -> Check:
     return Check(
         Kind.WEAK_INTERSECTION,
         f'the rays of a bead meet at up to {np.rad2deg(angle):.0f} degrees (median)',
-        advice='turn the phantom between the exposures, by a right angle in all',
+        advice='turn the phantom between the exposures, by 90 degrees in total',
         numbers={'angle_deg': float(np.rad2deg(angle))},
         value=1 / np.tan(max(angle, 1e-9) / 2),
         limit=1 / np.tan(MIN_ANGLE_RAD / 2),
@@ -184,7 +184,7 @@ def _check_distances(beads: SurveyedBeads) -> Check:
     if not beads.scaled.freedom:
         return Check(
             Kind.DISTANCES,
-            f'{scale} times that of the given coordinates by one distance, which nothing checks',
+            f'{scale} times that of the given coordinates, from one distance without a check',
             advice=advice,
             numbers=numbers,
         )
@@ -196,8 +196,8 @@ def _check_distances(beads: SurveyedBeads) -> Check:
     names = ' or '.join(distance.name for distance in named)
     return Check(
         Kind.DISTANCES,
-        f'{scale} times that of the given coordinates by {len(ratio)} distances; {names} is off '
-        f'by {abs(error):.3f} mm, {ratio[worst]:.1f} times its sd, the most',
+        f'{scale} times that of the given coordinates, from {len(ratio)} distances; the largest '
+        f'error, of {names}, is {abs(error):.3f} mm, {ratio[worst]:.1f} times its sd',
         Place(
             target_id=tuple(
                 end for distance in named for end in (distance.first, distance.second)
@@ -222,7 +222,7 @@ def _check_layout(beads: SurveyedBeads) -> Check:
         f'the beads lie {off_mm:.2f} mm from the given coordinates, neighbours are {nearest:.2f} '
         'mm apart',
         advice='check that the ids of the image points are those of the given coordinates, and '
-        'that their sd says how rough they are',
+        'that their sd states how rough they are',
         numbers={'off_mm': off_mm, 'spacing_mm': nearest},
         value=off_mm,
         limit=max(nearest / 2, tolerance),

@@ -81,7 +81,7 @@ def with_given_interior(evidence: Evidence, checks: Sequence[Check]) -> list[Che
 
 def _contradictions(evidence: Evidence, names: Sequence[str], distance: float) -> list[Check]:
     """Return a failed check for every fluoroscope whose exposures contradict the given values."""
-    evidence.report_step(f'{"+".join(names)}: interior orientation without what was given')
+    evidence.report_step(f'{"+".join(names)}: interior orientation without the given values')
     try:
         free = evidence.calibrate_free(names)
     except DataError:
@@ -110,11 +110,11 @@ def _given_interior_check(
     shown = ', '.join(f'{LABELS[i]} = {free.interior[i]:.1f} (sd {sd[i]:.1f})' for i in deviating)
     return Check(
         Kind.GIVEN_INTERIOR,
-        f'the given interior orientation, {stated} px, contradicts the '
-        f'exposures, which show {shown} px: the residuals are {rmse:.2f} px with what '
-        f'was given and {rmse_free:.2f} px without',
+        f'the given interior orientation, {stated} px, contradicts the exposures, which show '
+        f'{shown} px: the residuals are {rmse:.2f} px with the given values and {rmse_free:.2f} '
+        'px without',
         Place((name,)),
-        'give the right value, a larger --interior-sd, or none',
+        'give the correct value, a larger --interior-sd, or none',
         numbers={
             **{f'{label}_px': float(x) for label, x in zip(LABELS, free.interior)},
             **{f'sd_{label}_px': float(x) for label, x in zip(LABELS, sd)},
@@ -204,10 +204,10 @@ def trusted_angles(calibrations: Calibrations) -> list[Finding]:
     return [
         Finding(
             Kind.TAKEN_ON_TRUST,
-            'most of the error of the correction at an angle of the C-arm is one number, the '
-            'change of the principal distance over the range of angles: in '
-            f'{MANY_PERCENT} of 100 calibrations, errors are more than '
-            f'{np.sqrt(MANY_NSE):.1f} times the standard deviations',
+            'most of the error of the correction at an angle of the C-arm comes from one '
+            'quantity, the change of the principal distance over the range of angles: in '
+            f'{MANY_PERCENT} of 100 calibrations, errors are more than {np.sqrt(MANY_NSE):.1f} '
+            'times the standard deviations',
             Place((name,)),
             severity=Severity.NOTE,
             numbers={'nse': MANY_NSE, 'share': MANY_PERCENT / 100},
@@ -244,7 +244,7 @@ def validate_or_report(
     try:
         return validate(request, calibrations, progress, rig)
     except DataError as error:
-        check = Check(Kind.VALIDATION, f'the validation could not be made: {error}')
+        check = Check(Kind.VALIDATION, f'the validation could not be performed: {error}')
         return Validation('cannot tell', (check,), ids_of(calibrations), 0.0)
 
 

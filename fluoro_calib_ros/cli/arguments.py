@@ -117,18 +117,18 @@ def add_options(
         add_option(parser, options[name], **changes.get(name, {}))
 
 
-def add_address(parser: argparse.ArgumentParser, what: str, port: int) -> None:
-    """Add --host and --port of a server, with a default port; what: name of the server."""
+def add_address(parser: argparse.ArgumentParser, server: str, port: int) -> None:
+    """Add --host and --port of a server, with a default port; server: name of the server."""
     parser.add_argument(
         '--host',
         default='127.0.0.1',
-        help=f'address of {what}, 0.0.0.0 for all of this machine (default: 127.0.0.1)',
+        help=f'address of {server}, 0.0.0.0 for all interfaces (default: 127.0.0.1)',
     )
     parser.add_argument(
         '--port',
         type=number_in(0, 65535, int),
         default=port,
-        help=f'port of {what}, 0 for any free one (default: {port})',
+        help=f'port of {server}, 0 for any free port (default: {port})',
     )
 
 
@@ -272,7 +272,7 @@ def add_source(
         type=Path,
         metavar='CSV',
         help='table of doubtful image points and exposures (doubtful.csv) with your decisions: '
-        '"leave out", or the right target_id',
+        '"leave out", or the correct target_id',
     )
     add_file_options(parser)
     return group
@@ -347,7 +347,7 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
     """Add settings for facts that files of other programs do not contain."""
     group = parser.add_argument_group('files of other programs')
     group.add_argument(
-        '--units', choices=UNITS, help='unit of lengths, where the format does not say it'
+        '--units', choices=UNITS, help='unit of lengths, where the format does not state it'
     )
     group.add_argument(
         '--phantom-sd',
@@ -410,9 +410,9 @@ def add_scheduler(parser: argparse.ArgumentParser, task: str = 'extract the imag
     group.add_argument(
         '--scheduler',
         metavar='tls://HOST:PORT',
-        help=f'Dask scheduler whose workers {task}, in place of processes of this machine '
-        '(needs: pip install fluoro_calib_ros[cluster]); scheduler and workers can run any code '
-        'here: tcp:// only on this machine, else with certificates',
+        help=f'Dask scheduler whose workers {task}, instead of local processes (needs: pip '
+        'install fluoro_calib_ros[cluster]); scheduler and workers can run any code here: tcp:// '
+        'only on this machine, else with certificates',
     )
     for name, description in (
         ('ca', 'certificate of the authority of the cluster'),
@@ -425,7 +425,7 @@ def add_scheduler(parser: argparse.ArgumentParser, task: str = 'extract the imag
     group.add_argument(
         '--trusted-network',
         action='store_true',
-        help='allow tcp:// to another machine: whoever is in its network can run code here',
+        help='allow tcp:// to another machine: anyone in its network can run code here',
     )
 
 
@@ -485,7 +485,7 @@ def add_covariance(parser: Parser) -> None:
     parser.add_argument(
         '--covariance',
         action='store_true',
-        help='write the covariance matrix of all unknowns, too (*.covariance.npz)',
+        help='also write the covariance matrix of all unknowns (*.covariance.npz)',
     )
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..io.bags.salvage import BagReport, Damage, TopicReport
 
 NAME = 'bag'
-HELP = 'Record, play, look into and recover bags.'
+HELP = 'Record, play, inspect and recover bags.'
 EXAMPLE = 'fluoro-calib bag recover cut.mcap --out recovered'
 
 
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     recover.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
     add_out(recover, 'new bag, which must not exist', 'FOLDER')
-    info = _add_action(actions, 'info', 'Say what is in a bag and what is wrong with it.')
+    info = _add_action(actions, 'info', 'Report the content and the faults of a bag.')
     info.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
 
     record = _add_action(
@@ -97,10 +97,10 @@ def _recover(arguments: argparse.Namespace) -> None:
     lines += [_damage_text(damage) for damage in recovery.damages]
     if lost:
         counts = ', '.join(f'{topic} {count}' for topic, count in lost.items())
-        lines.append(f'lost in all, as the bag says how many it had: {counts}')
+        lines.append(f'lost in total, from the message counts of the bag: {counts}')
     elif not recovery.damages:
         lines.append('nothing is lost')
-    lines += [f'left out: {topic}: {reason}' for topic, reason in recovery.skipped.items()]
+    lines += [f'not recovered: {topic}: {reason}' for topic, reason in recovery.skipped.items()]
     print_result(arguments, document, '\n'.join(map(printable, lines)))
 
 
@@ -185,7 +185,7 @@ def _topic_document(topic: TopicReport) -> dict[str, Any]:
 def _damage_text(damage: Damage) -> str:
     """Return the lost time range, and the topics if known, as text."""
     if damage.start_ns is None and damage.end_ns is None:
-        period = 'all of the file'
+        period = 'the whole file'
     elif damage.end_ns is None:
         period = f'after {_time(damage.start_ns or 0)}'
     elif damage.start_ns is None:
@@ -193,7 +193,7 @@ def _damage_text(damage: Damage) -> str:
     else:
         period = f'between {_time(damage.start_ns)} and {_time(damage.end_ns)}'
     counts = ', '.join(f'{topic} {count}' for topic, count in damage.lost.items())
-    return f'gone: {period} ({damage.path}: {damage.cause})' + (f': {counts}' if counts else '')
+    return f'lost: {period} ({damage.path}: {damage.cause})' + (f': {counts}' if counts else '')
 
 
 def _time(ns: int) -> str:

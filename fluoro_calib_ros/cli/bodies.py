@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..jobs.bodies import BodiesOutcome
 
 NAME = 'bodies'
-HELP = 'Find the poses of bones from their markers, and the motion of joints, with their sd.'
+HELP = 'Estimate the poses of bones from their markers, and the motion of joints, with their sd.'
 EXAMPLE = (
     'fluoro-calib bodies rig/walking --bodies rig/bodies.csv --joints rig/joints.toml '
     '--calibration result --out motion'
@@ -44,20 +44,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--neutral',
         type=Path,
         metavar='RECORDING',
-        help='another recording with all joints in neutral position, in place of the exposures '
+        help='another recording with all joints in neutral position, instead of the exposures '
         'that the joints file names',
     )
     add_out(parser, 'folder to write')
     parser.add_argument(
         '--keep-shapes',
         action='store_true',
-        help='take the coordinates of the markers as they are, do not estimate them anew',
+        help='use the coordinates of the markers as given, without estimating them',
     )
     parser.add_argument(
         '--learn',
         action='store_true',
-        help='save the shapes with the calibration: the rig is healthy, and fluoro-calib heal '
-        'finds out by them what has changed later',
+        help='save the shapes of the bodies, recorded with a healthy rig, with the calibration: '
+        'fluoro-calib heal identifies later changes from them',
     )
     parser.add_argument(
         '--report',

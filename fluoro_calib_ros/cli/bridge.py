@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--token',
         default='',
-        help='what the address of a client ends with, ?token=... (default: a new one, printed)',
+        help='token that ends the address of a client, ?token=... (default: a new one, printed)',
     )
     parser.add_argument(
         '--origins',

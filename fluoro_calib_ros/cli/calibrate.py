@@ -72,14 +72,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     result.add_argument(
         '--force',
         action='store_true',
-        help='calibrate even if the input or the result cannot be right, for example with another '
+        help='calibrate even if the input or the result is implausible, for example with another '
         'phantom; the reasons are written to result.json',
     )
     result.add_argument(
         '--fast',
         action='store_true',
-        help='write neither the verdict (see validate) nor the report; they take about '
-        'twice as long as the calibration',
+        help='skip the verdict (see validate) and the report, which take about twice as long as '
+        'the calibration',
     )
     result.add_argument(
         '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
@@ -286,7 +286,7 @@ def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
     from ..jobs.result_folder import written_document
     from ..report.tables import summary_table, verdict_line
 
-    print_findings(outcome.result.findings, 'this cannot be right: ')
+    print_findings(outcome.result.findings, 'implausible: ')
     document = written_document(outcome.result)
     lines = [summary_table(outcome.result).rstrip()]
     if outcome.validation is not None:
@@ -331,8 +331,8 @@ def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
 
     if survey is None:
         raise DataError(
-            f'{arguments.source}: beads are only found in images of a phantom that does not move '
-            'in its own frame, without a column exposure'
+            f'{arguments.source}: beads in images need a phantom file with fixed coordinates, '
+            'without a column exposure'
         )
     with ProgressBar('extract') as bar:
         return recording_of_images(

@@ -12,7 +12,7 @@ from ..findings import sentences
 from .output import print_notes, print_result
 
 NAME = 'compare'
-HELP = 'Tell what changed between two calibrations, where in the image, and whether significantly.'
+HELP = 'Compare two calibrations: what changed, where in the image, and whether significantly.'
 EXAMPLE = 'fluoro-calib compare result.previous result --figure changes.png'
 
 

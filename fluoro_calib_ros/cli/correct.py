@@ -75,13 +75,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     folders = parser.add_argument_group('folders of images and videos')
     folders.add_argument(
-        '--recursive', action='store_true', help='correct the folders in SOURCE, too'
+        '--recursive', action='store_true', help='also correct the folders in SOURCE'
     )
     folders.add_argument(
         '--keep-going',
         action='store_true',
-        help='pass over files that cannot be corrected, and name them; without it, one of them '
-        'ends the command and nothing is written',
+        help='skip files that cannot be corrected, and list them; by default, one of them ends '
+        'the command and nothing is written',
     )
     add_workers(folders)
     add_scheduler(parser, 'correct the files; they see the folders under the same names')
@@ -107,7 +107,7 @@ def run(arguments: argparse.Namespace) -> None:
     else:
         suffixes = listed(('.csv', *READ_SUFFIXES))
         raise DataError(
-            f'{arguments.source}: files with the ending {suffix_of(arguments.source)} cannot be '
+            f'{arguments.source}: files with the suffix {suffix_of(arguments.source)} cannot be '
             f'read, only {suffixes} and folders of images'
         )
 

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='SOURCE',
         help='grey images (png, tif, jpg, bmp, pgm), folders of images, TIFF stacks, videos '
         '(avi, mkv, mp4, cine), DICOM files, bags with images; an exposure has the number in the '
-        'name of its file, else its place in the order',
+        'name of its file, else its position in the order',
     )
     add_phantom(
         parser,
@@ -80,15 +80,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--overlay',
         type=Path,
         metavar='DIR',
-        help='folder for pictures of what was found, matched and refused',
+        help='folder for pictures of found, matched and rejected beads',
     )
     add_workers(parser)
     add_scheduler(parser)
     parser.add_argument(
         '--regular-grid',
         action='store_true',
-        help='the phantom is a regular flat grid, which fits in many places: take any of them; '
-        'this serves the distortion of one fluoroscope, not the orientation of two',
+        help='the phantom is a regular flat grid, which fits at many offsets: accept any of '
+        'them; this suffices for the distortion of one fluoroscope, not for the orientation of '
+        'two',
     )
     _add_markers(parser.add_argument_group('markers in motion'))
     angles = parser.add_argument_group('angle of a C-arm')
@@ -105,9 +106,9 @@ def _add_markers(group: argparse._ArgumentGroup) -> None:
         '--markers',
         type=Path,
         metavar='FILE',
-        help='ids and places of the markers in one exposure, to a pixel or two: '
-        'fluoroscope,exposure,target_id,u,v, or XMALab points; they are followed from it on, and '
-        'those of later exposures enter there, or are found again',
+        help='ids and image points of the markers in one exposure, to a pixel or two: '
+        'fluoroscope,exposure,target_id,u,v, or XMALab points; markers are followed from this '
+        'exposure; those given for later exposures start or resume there',
     )
     group.add_argument(
         '--calibration',
@@ -125,15 +126,15 @@ def _add_markers(group: argparse._ArgumentGroup) -> None:
         '--cluster-shapes',
         type=Path,
         metavar='FILE',
-        help='coordinates target_id,x,y,z,sd [mm] of the markers of each --cluster in a frame of '
-        'its own, or of any phantom format; without --markers, they give the ids',
+        help='coordinates target_id,x,y,z,sd [mm] of the markers of each --cluster in any frame, '
+        'or in any phantom format; without --markers, they determine the ids',
     )
     group.add_argument(
         '--bodies',
         type=Path,
         metavar='FILE',
-        help='bodies.csv: rigid bodies and the places of their markers, in the place of '
-        '--cluster; without --markers, the shapes give the ids',
+        help='bodies.csv: rigid bodies and the coordinates of their markers, instead of '
+        '--cluster; without --markers, the shapes determine the ids',
     )
     add_options(group, MarkerOptions, ('shutter', 'gate', 'lost_after', 'search_every'))
 
@@ -151,16 +152,16 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
         if len(arguments.fluoroscope) != 1:
             error('--fluoroscope: the images of a phantom are of one fluoroscope')
         if arguments.rigid:
-            error('--cluster is for --markers')
+            error('--cluster needs --markers')
         return
     if len(arguments.fluoroscope) > 1:
         if arguments.calibration is None:
-            error('markers of several fluoroscopes are followed with their --calibration')
+            error('markers of several fluoroscopes need their --calibration')
         if len(arguments.sources) not in (1, len(arguments.fluoroscope)):
             error('give one SOURCE for each fluoroscope, or one for all')
     elif arguments.rigid or arguments.bodies is not None:
         error(
-            'rigid bodies are for two fluoroscopes or more, the --fluoroscope A,B and their '
+            'rigid bodies need two fluoroscopes or more, --fluoroscope A,B, and their '
             '--calibration'
         )
 
@@ -293,7 +294,8 @@ def _run_markers(arguments: argparse.Namespace) -> None:
         marker_names = Names({name: number for number, name in request.target_names.items()})
         doubtful_table(doubtful, marker_names).write(doubtful_path)
         print_note(
-            f'{doubtful_path}: decide on the doubtful ids there, and give it with --decisions'
+            f'{doubtful_path}: decide on the doubtful ids in this file, and pass it with '
+            '--decisions'
         )
     print_result(
         arguments, _marker_document(arguments.out, outcome), _marker_text(arguments.out, outcome)
@@ -360,7 +362,7 @@ def _doubt_texts(spans: list[DoubtfulSpan], request: MarkerRequest) -> list[str]
     for span in spans:
         name = request.target_names.get(span.target_id, str(span.target_id))
         candidates = ' or '.join(request.target_names.get(i, str(i)) for i in span.others)
-        doubt = f'may be {candidates}' if candidates else 'may be something else'
+        doubt = f'may be {candidates}' if candidates else 'may be another object'
         texts.append(
             f'fluoroscope {span.fluoroscope}: marker {name} {doubt} in exposures {span.first} to '
             f'{span.last}: {span.reason}'
@@ -407,10 +409,10 @@ def _marker_text(out: Path, outcome: MarkerOutcome) -> str:
         total = measured + sum(len(r.markers.missing) for r in results)
         doubtful = sum(int(r.markers.doubtful.sum()) for r in results)
         lines.append(
-            f'fluoroscope {name}: {len(results)} images, {measured} of {total} places of '
+            f'fluoroscope {name}: {len(results)} images, {measured} of {total} image points of '
             f'markers measured, {doubtful} with a doubtful id'
         )
     exchanged = [d for d in outcome.decisions if d.kind == 'exchanged']
     if exchanged:
-        lines.append(f'{len(exchanged)} pairs of ids were exchanged back')
+        lines.append(f'{len(exchanged)} exchanged pairs of ids were restored')
     return '\n'.join([*lines, f'written to {out}'])

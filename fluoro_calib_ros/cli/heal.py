@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..jobs.healing import HealingOutcome
 
 NAME = 'heal'
-HELP = 'Find out from ordinary markers what has changed in a rig, and calibrate that anew.'
+HELP = 'Identify from ordinary markers what has changed in a rig, and recalibrate it.'
 EXAMPLE = 'fluoro-calib heal rig/walking --calibration result --out healed'
 
 
@@ -101,9 +101,9 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
     if healed is None or not is_changed:
         is_evident = is_changed or outcome.changed_meanwhile
         prefix = '' if is_evident else 'no change of the rig is evident: '
-        caveat = 'its sd contain an unseen knock and an unseen drift of the distortion'
+        caveat = 'its sd include an undetected knock and an undetected drift of the distortion'
         conclusion = 'nothing is written' if healed is None else caveat
-        lines.append(f'{prefix}it stays as it was calibrated, {conclusion}')
+        lines.append(f'{prefix}the calibration stays as it was, {conclusion}')
     if healed is not None:
         for f, name in enumerate(outcome.orientation.fluoroscopes):
             if healed.changes[f].any():

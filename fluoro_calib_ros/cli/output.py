@@ -95,10 +95,10 @@ def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:
         )
 
 
-def print_round(label: str, this: Round) -> None:
+def print_round(label: str, current: Round) -> None:
     """Print a round of a self-calibration, on a terminal only."""
     if sys.stderr.isatty():
-        print_status(f'{label}: {this}')
+        print_status(f'{label}: {current}')
 
 
 def print_step(step: str, done: int, total: int) -> None:

@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='append',
         default=[],
         metavar='ROW,COLUMN[,LAYER]',
-        help='place without hole or bead, counted from 1 at the upper left; repeat it',
+        help='position without hole or bead, counted from 1 at the upper left; repeatable',
     )
     parser.add_argument(
         '--sd',
@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--picture',
         type=Path,
         metavar='FILE',
-        help='picture with ids, .svg or .png, to hold against the part (default: OUT.svg)',
+        help='picture with ids, .svg or .png, to compare with the part (default: OUT.svg)',
     )
     parser.add_argument(
         'file', type=Path, nargs='?', metavar='OUT.csv', help='phantom file to write'
@@ -155,8 +155,8 @@ def run(arguments: argparse.Namespace) -> None:
         'blocked': drawing.blocked_id.tolist(),
     }
     text = (
-        f'{count} targets, {len(drawing.blocked_id)} places are blocked\n'
-        f'written to {arguments.out}; hold {picture} against the part: ids from the upper left, '
-        'blocked places crossed out'
+        f'{count} targets, {len(drawing.blocked_id)} positions are blocked\nwritten to '
+        f'{arguments.out}; compare {picture} with the part: ids from the upper left, blocked '
+        'positions crossed out'
     )
     print_result(arguments, document, text)

@@ -62,7 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--again', action='store_true', help='do all steps again')
     parser.add_argument(
-        '--dry-run', action='store_true', help='print the commands of the study, and do nothing'
+        '--dry-run',
+        action='store_true',
+        help='print the commands of the study without running them',
     )
     add_exit_zero(parser)
 
@@ -162,8 +164,8 @@ def _process(
         verdict = stored_verdict(study.calibration).verdict or 'cannot tell'
         if verdict == 'fail':
             raise DataError(
-                f'the verdict of the calibration is fail, the trials are not processed: '
-                f'fluoro-calib report {study.folder / study.calibration} says why'
+                'the verdict of the calibration is fail, the trials are not processed: '
+                f'fluoro-calib report {study.folder / study.calibration} shows the reasons'
             )
         work.run(trials.values(), arguments.workers)
     rows = [
@@ -247,7 +249,7 @@ class _StepMaker:
         for key, value in options.items():
             name = key.replace('-', '_')
             if name in OF_PROCESS and (command, name) != ('calibrate', SOURCE):
-                error(f'the key {key} follows from the study')
+                error(f'the key {key} is set by the study')
             if name != SOURCE:
                 all_words += _option_words(key, value, error)
         values = vars(self._parse(all_words, error))

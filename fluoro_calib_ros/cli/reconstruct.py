@@ -62,8 +62,8 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
         error('--cluster is for the drift watch, it cannot be used with --no-drift-watch')
     if arguments.bodies and not is_bag(arguments.source):
         error(
-            f'--cluster is for the drift watch, but {arguments.source}, which is no bag, '
-            'does not contain the times of its exposures'
+            '--cluster is for the drift watch, which needs the times of the exposures: '
+            f'{arguments.source} is not a bag'
         )
 
 
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> None:
         print_note(f'{arguments.source}: {outcome.noise.sentence}')
     if outcome.widening > 1:
         advice = (
-            'check the sigma of the image points, whether they are corrected already or count '
+            'check the sigma of the image points, whether they are already corrected or count '
             'from 1, and whether a fluoroscope has moved since its calibration'
         )
         print_note(

@@ -13,7 +13,7 @@ from .arguments import add_result_folder, result_folder
 from .output import ProgressBar, print_result
 
 NAME = 'report'
-HELP = 'Write the report of a calibration as one HTML file to hand on.'
+HELP = 'Write the report of a calibration as one self-contained HTML file.'
 EXAMPLE = 'fluoro-calib report result'
 
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--pdf',
         action='store_true',
-        help='print it as DIR/report.pdf, too, by the Chromium, Chrome or Edge of this machine',
+        help='also print it as DIR/report.pdf, with the Chromium, Chrome or Edge of this machine',
     )
 
 

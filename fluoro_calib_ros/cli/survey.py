@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = add_source(parser, 'image size of a file that does not contain it [px]')
     add_phantom(
         source,
-        help='coordinates as far as they are known: to some centimetres for a phantom of some '
-        'decimetres; any file of a phantom, or one of the command phantom',
+        help='approximate coordinates, to a few centimetres for a phantom of a few decimetres; '
+        'any phantom file, or one of the command phantom',
     )
     add_collect(source)
     add_bag_options(parser)
@@ -77,10 +77,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--keep-given',
         action='store_true',
         help='beads that cannot be surveyed keep their given coordinates, with the sd that the '
-        'others show (default: left out)',
+        'others show (default: excluded)',
     )
     parser.add_argument(
-        '--force', action='store_true', help='write the coordinates though the verdict is fail'
+        '--force', action='store_true', help='write the coordinates even if the verdict is fail'
     )
     add_out(parser, 'phantom file to write', 'OUT.csv')
 
@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace) -> None:
     )
     with ErrorsAt(arguments.source):
         outcome = survey(request, print_round)
-    print_findings(outcome.findings, 'this cannot be right: ')
+    print_findings(outcome.findings, 'implausible: ')
     failed = [check for check in outcome.validation.checks if check.passed is False]
     is_written = not failed or arguments.force
     if is_written:

@@ -29,14 +29,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--web',
         action='store_true',
-        help='offer a page for a browser beside the machine: state, radiographs, points in space',
+        help='serve a page for a browser near the X-ray machine: state, radiographs, points '
+        'in space',
     )
     parser.add_argument(
         '--dicom',
         type=Path,
         metavar='FOLDER',
-        help='where the machine writes DICOM files, in a folder for each fluoroscope: the page '
-        'tells their dose, else that of a rig.toml',
+        help='folder in which the X-ray machine writes DICOM files, with a folder for each '
+        'fluoroscope: the page shows their dose (default: that of rig.toml)',
     )
     add_address(parser, 'the page', 8080)
 

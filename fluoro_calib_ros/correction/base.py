@@ -105,8 +105,7 @@ class CorrectionModel(ABC):
         hull = _half_planes(self._calibrated_points(uv))
         if len(hull) > MAX_CORNERS:
             raise ValueError(
-                f'the calibrated area has {len(hull)} corners, more than the {MAX_CORNERS} that '
-                'are possible'
+                f'the calibrated area has {len(hull)} corners, at most {MAX_CORNERS} are possible'
             )
         holes = _holes_of(uv, hull) if self.keeps_training_points else None
         self._set(train_uv=uv, train_duv=duv, _hull=hull, _holes=holes)

@@ -186,7 +186,9 @@ def model_type(kind: str) -> type[CorrectionModel]:
     try:
         return MODELS[kind]
     except KeyError:
-        raise ValueError(f'correction model is one of {", ".join(MODELS)}, not {kind!r}') from None
+        raise ValueError(
+            f'correction model must be one of {", ".join(MODELS)}, not {kind!r}'
+        ) from None
 
 
 def selectable_models() -> tuple[str, ...]:

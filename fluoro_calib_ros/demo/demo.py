@@ -152,7 +152,7 @@ def report(
     lines = [*_image_lines(bags, client, job), '', _space_line(bags, client), knee_text, '']
     lines += ['Calibrated from coordinates and from radiographs:', comparison, '']
     lines.append(
-        'Calibration through the nodes and without ROS the same to the last bit: '
+        'Calibration through the nodes and without ROS is identical to the last bit: '
         + ', '.join(f'{name} {"yes" if ok else "NO"}' for name, ok in is_equal.items())
     )
     lines.append(

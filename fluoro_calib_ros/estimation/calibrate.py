@@ -175,11 +175,11 @@ def calibrate_request(
 
 
 def calibrate_part(
-    request: CalibrationRequest, starts: StartValues, whole: Calibrations
+    request: CalibrationRequest, starts: StartValues, earlier: Calibrations
 ) -> dict[str, FluoroscopeCalibration]:
     """Self-calibrate with some of the exposures of an earlier calibration.
 
-    request: has the frames of these exposures. starts, whole: from the calibration of all
+    request: has the frames of these exposures. starts, earlier: from the calibration of all
     exposures, whose image noise is used. Raises DataError if the exposures do not suffice.
     """
     out: dict[str, FluoroscopeCalibration] = {}
@@ -191,7 +191,7 @@ def calibrate_part(
             seconds = time.perf_counter() - start
             for f, name in enumerate(run.measured.fluoroscopes):
                 digest = digest_of_sources(frames[name], request.phantom)
-                noise = _ImageNoise(whole[name].image_sd, whole[name].noise_profile)
+                noise = _ImageNoise(earlier[name].image_sd, earlier[name].noise_profile)
                 out[name] = _calibration(
                     run, f, name=name, digest=digest, seconds=seconds, noise=noise
                 )

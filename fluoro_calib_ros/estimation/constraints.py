@@ -198,8 +198,8 @@ def _without_targets_of_few_rays(measured: Measured) -> Measured:
     )
     excluded = Finding(
         Kind.FEW_RAYS,
-        f'{few.sum()} targets are seen in fewer than {MIN_RAYS} exposures, which do not determine '
-        f'them safely without surveyed coordinates: {first_few(measured.target_id[few])}',
+        f'{few.sum()} targets are seen in fewer than {MIN_RAYS} exposures, too few to determine '
+        f'them without surveyed coordinates: {first_few(measured.target_id[few])}',
         Place(target_id=tuple(measured.target_id[few].tolist())),
         severity=Severity.NOTE,
     )

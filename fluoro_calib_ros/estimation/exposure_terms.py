@@ -431,15 +431,15 @@ class _Effects:
     of the harmonics, and one for the random remainder, are estimated from all terms.
     """
 
-    def __init__(self, own: ExposureTerms, h: NDArray[np.float64]) -> None:
-        terms = len(own.variance)
+    def __init__(self, exposure_terms: ExposureTerms, h: NDArray[np.float64]) -> None:
+        terms = len(exposure_terms.variance)
         self.design = np.hstack([np.kron(h, np.eye(terms)), np.eye(len(h) * terms)])
         self.count = HARMONICS * terms
         order_of_harmonic = np.repeat(np.arange(HARMONICS) // 2, terms)
         self._factor_of = np.append(order_of_harmonic, np.full(len(h) * terms, ORDERS))
         size = float(np.mean(h**2))
         unit = np.append(np.full(self.count, 1 / size), np.ones(len(h) * terms))
-        self._unit = unit * np.tile(own.variance, HARMONICS + len(h))
+        self._unit = unit * np.tile(exposure_terms.variance, HARMONICS + len(h))
         self._factors = np.full(ORDERS + 1, 1 / (ORDERS + 1))
 
     @property

@@ -46,8 +46,7 @@ START_GROSS = 0.01  # initial share of gross errors when the noise is estimated
 ADVICE = 'add exposures with the phantom turned and moved'
 TOO_FLAT = replace(
     UNTILTED,
-    cause='the targets are flat and tilted too little, so that the principal distance cannot be '
-    'found',
+    cause='the targets are flat and tilted too little to determine the principal distance',
 )
 SINGULAR = f'the exposures do not determine the unknowns: the normal matrix is singular; {ADVICE}'
 
@@ -268,31 +267,36 @@ def measured_network(
     )
 
 
-def _measured(task: _Task, found: Mapping[str, _Resected]) -> Measured:
+def _measured(task: _Task, resected_views: Mapping[str, _Resected]) -> Measured:
     """Return the network of resected exposures {fluoroscope: _Resected}."""
-    frames = [frame for resected in found.values() for frame in resected.frames]
-    resections = [resection for resected in found.values() for resection in resected.resections]
+    frames = [frame for resected in resected_views.values() for frame in resected.frames]
+    resections = [
+        resection for resected in resected_views.values() for resection in resected.resections
+    ]
     fluoroscope = np.repeat(
-        np.arange(len(found)), [len(resected.frames) for resected in found.values()]
+        np.arange(len(resected_views)),
+        [len(resected.frames) for resected in resected_views.values()],
     )
-    network, target_id = _index(frames, fluoroscope, task, len(found))
+    network, target_id = _index(frames, fluoroscope, task, len(resected_views))
     if task.known:
         network = replace(network, exterior=_exterior_prior(task, frames))
     earlier = None if task.starts is None or task.sensors is not None else task.starts.earlier
     start = Parameters(
-        np.array([resected.interior for resected in found.values()]),
+        np.array([resected.interior for resected in resected_views.values()]),
         np.array([resection.rotation for resection in resections]),
         np.array([resection.position_mm for resection in resections]),
         network.survey_mm.copy() if earlier is None else earlier.points(target_id),
     )
-    sizes = tuple(resected.frames[0].image_size for resected in found.values())
-    excluded = tuple(finding for resected in found.values() for finding in resected.excluded)
-    untilted = tuple(resected.untilted for resected in found.values())
-    known = {name: task.known[name] for name in found if name in task.known}
+    sizes = tuple(resected.frames[0].image_size for resected in resected_views.values())
+    excluded = tuple(
+        finding for resected in resected_views.values() for finding in resected.excluded
+    )
+    untilted = tuple(resected.untilted for resected in resected_views.values())
+    known = {name: task.known[name] for name in resected_views if name in task.known}
     return Measured(
         network=network,
         start=start,
-        fluoroscopes=tuple(found),
+        fluoroscopes=tuple(resected_views),
         image_size=sizes,
         frames=tuple(frames),
         target_id=target_id,
@@ -402,9 +406,11 @@ def _start_all(
     return resections, interior, _reject_poor_fits(frames, resections)
 
 
-def _are_untilted(task: _Task, frames: Sequence[Frame], found: Sequence[Resection | None]) -> bool:
+def _are_untilted(
+    task: _Task, frames: Sequence[Frame], resections: Sequence[Resection | None]
+) -> bool:
     """Whether all exposures show flat targets parallel to the image."""
-    for frame, resection in zip(frames, found):
+    for frame, resection in zip(frames, resections):
         if resection is None:
             continue
         xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
@@ -413,7 +419,7 @@ def _are_untilted(task: _Task, frames: Sequence[Frame], found: Sequence[Resectio
             or tilt_of(resection.rotation, plane_of(xyz)) > UNTILTED_RAD
         ):
             return False
-    return any(resection is not None for resection in found)
+    return any(resection is not None for resection in resections)
 
 
 def is_hardly_tilted(measured: Measured) -> bool:
@@ -426,11 +432,11 @@ def is_hardly_tilted(measured: Measured) -> bool:
 
 
 def _require_determined(
-    task: _Task, name: str, found: Sequence[Resection | None], untilted: bool
+    task: _Task, name: str, resections: Sequence[Resection | None], untilted: bool
 ) -> None:
     """Raise DataError if the poses do not determine the principal distance."""
     if not untilted:
-        _require_different_poses(name, found)
+        _require_different_poses(name, resections)
     elif task.principal_distance is None:
         raise DataError(replace(UNTILTED, place=Place((name,))))
 
@@ -521,12 +527,14 @@ def _start_interior(task: _Task, name: str, views: Sequence[View]) -> NDArray[np
     return nominal_interior(size, distance)
 
 
-def _reject_poor_fits(frames: Sequence[Frame], found: list[Resection | None]) -> list[Finding]:
+def _reject_poor_fits(
+    frames: Sequence[Frame], resections: list[Resection | None]
+) -> list[Finding]:
     """Replace resections with too large residuals by None; return a finding for each."""
-    scales = [resection.scale for resection in found if resection is not None]
+    scales = [resection.scale for resection in resections if resection is not None]
     typical = np.median(scales) if scales else np.inf
     out = []
-    for row, (frame, resection) in enumerate(zip(frames, found)):
+    for row, (frame, resection) in enumerate(zip(frames, resections)):
         if resection is not None and resection.scale > MAX_MISFIT * typical:
             out.append(
                 Finding(
@@ -538,14 +546,14 @@ def _reject_poor_fits(frames: Sequence[Frame], found: list[Resection | None]) ->
                     numbers={'residual_px': float(resection.scale)},
                 )
             )
-            found[row] = None
+            resections[row] = None
     return out
 
 
-def _not_oriented(frame: Frame, why: Finding) -> Finding:
+def _not_oriented(frame: Frame, reason: Finding) -> Finding:
     """Return the reason why an exposure without orientation is excluded."""
-    kind = Kind.NOT_ORIENTED if why.kind is Kind.DATA else why.kind
-    return replace(why, kind=kind, place=frame.place, severity=Severity.NOTE)
+    kind = Kind.NOT_ORIENTED if reason.kind is Kind.DATA else reason.kind
+    return replace(reason, kind=kind, place=frame.place, severity=Severity.NOTE)
 
 
 def _require_different_poses(name: str, resections: Sequence[Resection | None]) -> None:

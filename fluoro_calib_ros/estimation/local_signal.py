@@ -213,8 +213,8 @@ class _ShownBumps:
         """Return all windows."""
         return [self._place(rows) for rows in _windows(self.image_size, self.nodes)]
 
-    def most_likely_band(self, taken: NDArray[np.bool_]) -> _Place | None:
-        """Return the band with the largest gain, without the bumps that are taken (n,).
+    def most_likely_band(self, used: NDArray[np.bool_]) -> _Place | None:
+        """Return the band with the largest gain, without the used bumps (n,).
 
         Only the bands whose single bumps are least likely to be zero are examined.
         """
@@ -224,12 +224,12 @@ class _ShownBumps:
         ratio = np.divide(squares, level, out=np.zeros_like(squares), where=level > 0)
         excess = np.sum(ratio - 1, axis=1)
         bands = _bands(self.image_size)
-        number = bands @ ~taken
-        score = (bands @ np.where(taken, 0.0, excess)) / np.sqrt(np.maximum(number, 1))
+        number = bands @ ~used
+        score = (bands @ np.where(used, 0.0, excess)) / np.sqrt(np.maximum(number, 1))
         score[number < NODES] = -np.inf
         best = np.argsort(score)[-LIKELY_BANDS:]
         candidates = [
-            self._place(np.flatnonzero((bands[i] > 0) & ~taken))
+            self._place(np.flatnonzero((bands[i] > 0) & ~used))
             for i in best[score[best] > -np.inf]
         ]
         return max(candidates, key=lambda band: band.gain, default=None)

@@ -259,13 +259,13 @@ class CalibrationOptions:
     )
     interior: str = option(
         'estimated',
-        'interior orientation, estimated, or fixed, its error being learned by the model',
+        'interior orientation: estimated, or fixed, where the model absorbs its error',
         choices=INTERIORS,
     )
     loss: str = option('student_t', 'noise model of the image points', choices=LOSSES)
     k: int | None = option(
         None,
-        'neighbours of knn, local_linear or hybrid; by default chosen',
+        'neighbours of knn, local_linear or hybrid; automatic by default',
         minimum=1,
         maximum=MAX_NEIGHBOURS,
     )
@@ -287,7 +287,7 @@ class CalibrationOptions:
     )
     interior_sd: tuple[float, ...] | None = option(
         None,
-        'standard deviations of the start values of xp, yp and c; by default they are not known',
+        'standard deviations of the start values of xp, yp and c; unknown by default',
         unit='px',
         length=3,
     )
@@ -296,19 +296,19 @@ class CalibrationOptions:
         self._validate_model()
         if self.k is not None and self.model not in neighbour_models():
             raise ValueError(
-                f'k is a number of neighbours, which the model {self.model_name} does not have'
+                f'k is a number of neighbours, but the model {self.model_name} has none'
             )
         if self.max_iterations < 1 or not self.tolerance > 0:
-            raise ValueError('max_iterations is at least 1 and tolerance above 0')
+            raise ValueError('max_iterations must be at least 1, and tolerance above 0')
         for name, size in (('relative_sd', 2), ('interior_sd', 3)):
             value = getattr(self, name)
             if value is not None:
                 # a list if it was read from a file
                 object.__setattr__(self, name, tuple(float(v) for v in value))
                 if len(value) != size or not all(v > 0 for v in value):
-                    raise ValueError(f'{name} is {size} numbers above 0')
+                    raise ValueError(f'{name} must be {size} numbers above 0')
         if self.interior_sd is not None and self.interior == 'fixed':
-            raise ValueError('interior_sd goes with an interior orientation that is estimated')
+            raise ValueError('interior_sd requires an estimated interior orientation')
         validate_options(self, except_for=() if isinstance(self.model, str) else ('model',))
 
     def _validate_model(self) -> None:
@@ -321,7 +321,9 @@ class CalibrationOptions:
                     'on the command line and in Python, not from a file, message or parameter'
                 )
         elif not is_regressor(self.model):
-            raise ValueError(f'model is a name or a scikit-learn regressor, not {self.model!r}')
+            raise ValueError(
+                f'model must be a name or a scikit-learn regressor, not {self.model!r}'
+            )
 
     @property
     def model_name(self) -> str:

@@ -184,14 +184,14 @@ def _with_trend(
 
 
 def _moved_once(
-    off: NDArray[np.float64], weights: NDArray[np.float64], columns: NDArray[np.float64]
+    discrepancies: NDArray[np.float64], weights: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> bool:
     """Whether one step explains nearly all of discrepancies (k, 6) about a trend."""
     remaining = [
-        np.sum(_about_trend(off, weights, weights, np.hstack([columns, step]))[0] ** 2)
-        for step in steps_of(len(off))
+        np.sum(_about_trend(discrepancies, weights, weights, np.hstack([columns, step]))[0] ** 2)
+        for step in steps_of(len(discrepancies))
     ]
-    total = np.sum(_about_trend(off, weights, weights, columns)[0] ** 2)
+    total = np.sum(_about_trend(discrepancies, weights, weights, columns)[0] ** 2)
     return bool(remaining) and min(remaining) <= MOVED_SHARE * total
 
 
@@ -204,7 +204,7 @@ def steps_of(count: int) -> list[NDArray[np.float64]]:
 
 
 def _about_trend(
-    off: NDArray[np.float64],
+    discrepancies: NDArray[np.float64],
     shared: NDArray[np.float64],
     weights: NDArray[np.float64],
     columns: NDArray[np.float64],
@@ -213,12 +213,12 @@ def _about_trend(
 
     The trend is estimated with the weights `shared` (k, 6, 6).
     """
-    size = off.shape[1] * columns.shape[1]
+    size = discrepancies.shape[1] * columns.shape[1]
     normal = np.einsum('ka,kb,kij->aibj', columns, columns, shared).reshape(size, size)
-    right = np.einsum('ka,kij,kj->ai', columns, shared, off).ravel()
+    right = np.einsum('ka,kij,kj->ai', columns, shared, discrepancies).ravel()
     coefficients = np.linalg.lstsq(normal, right, rcond=None)[0]
     trend = columns @ coefficients.reshape(columns.shape[1], -1)
-    residuals = off - trend
+    residuals = discrepancies - trend
     return np.sqrt(np.einsum('ki,kij,kj->k', residuals, weights, residuals) / 6), trend
 
 

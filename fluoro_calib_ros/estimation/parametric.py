@@ -55,12 +55,12 @@ FAR = 8.0  # standard deviations beyond which the tail of a Gaussian is negligib
 
 
 def squared_error_of_kept(
-    ratio: NDArray[np.float64], kept: NDArray[np.float64]
+    ratio: NDArray[np.float64], fraction: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return expected squared errors (t,) of terms, in units of the variances of their estimates.
 
-    ratio: (t,) estimates without a prior, over their standard deviations. kept: (t,) fractions of
-    these estimates that are kept, 0 to 1. Errors are posterior variances about the kept values.
+    ratio: (t,) estimates without a prior, over their standard deviations. fraction: (t,) of
+    these estimates that is kept, 0 to 1. Errors are posterior variances about the kept values.
     """
     half = np.square(ratio) / 2
     x, weight = np.polynomial.legendre.leggauss(NODES)
@@ -74,8 +74,8 @@ def squared_error_of_kept(
     density /= evidence[:, None]
     share = 1 - k
     variance = np.sum(density * share, axis=1)
-    square = np.sum(density * np.square(share - kept[:, None]), axis=1)
-    return chance * (variance + 2 * half * square) + (1 - chance) * 2 * half * np.square(kept)
+    square = np.sum(density * np.square(share - fraction[:, None]), axis=1)
+    return chance * (variance + 2 * half * square) + (1 - chance) * 2 * half * np.square(fraction)
 
 
 def covariance_with_uncertain_terms(

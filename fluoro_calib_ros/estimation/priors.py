@@ -313,8 +313,8 @@ def with_shown_places(
     # Terms that the image points do not separate.
     matrix[np.arange(t), np.arange(t)] += RIDGE * np.max(np.diagonal(matrix))
 
-    def estimates(given: Prior) -> SineEstimates:
-        precision = signal_precision(functions, given)
+    def estimates(candidate: Prior) -> SineEstimates:
+        precision = signal_precision(functions, candidate)
         with_prior = matrix.copy()
         with_prior[t:, t:] += precision
         factor = cho_factor(with_prior, lower=True)

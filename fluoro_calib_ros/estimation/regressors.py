@@ -123,7 +123,7 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
             self, X, y, multi_output=True, y_numeric=True, dtype=np.float64
         )
         if self.n_neighbors < 1:
-            raise ValueError(f'n_neighbors is at least 1, not {self.n_neighbors}')
+            raise ValueError(f'n_neighbors must be at least 1, not {self.n_neighbors}')
         weight = np.ones(len(samples))
         if sample_weight is not None:
             weight = _check_sample_weight(sample_weight, samples, dtype=np.float64)

@@ -260,7 +260,7 @@ def orientation_and_scatter(
         return with_datum_of_points(orientation, _seen_by_first(fixed)), scatter
     except np.linalg.LinAlgError:
         raise DataError(
-            'the fluoroscopes see the phantom from one place, so that their rays do not intersect'
+            'the sources of the fluoroscopes coincide, so their rays do not intersect'
         ) from None
 
 
@@ -309,7 +309,7 @@ def _validate(frames: Frames, phantom: Phantom, calibrations: Calibrations) -> N
     """Raise DataError if frames and calibrations do not belong together."""
     if len(frames) < 2:
         raise DataError(
-            'a rig has two fluoroscopes or more, there are frames of '
+            'a rig needs two fluoroscopes or more, there are frames of '
             f'{", ".join(frames) or "none"} only'
         )
     for name, exposures in frames.items():
@@ -414,8 +414,8 @@ def _paired(frames: Frames) -> dict[str, list[Frame]]:
 def _unpaired(names: Sequence[str], b: int) -> str:
     """Return the message on fluoroscopes without paired exposures."""
     return (
-        f'fluoroscopes {names[0]} and {names[b]}: no exposures have the same number, so that '
-        'their relative orientation is not known'
+        f'fluoroscopes {names[0]} and {names[b]}: no exposures have the same number, so their '
+        'relative orientation is unknown'
     )
 
 

@@ -129,7 +129,7 @@ def estimator_of(model: Any) -> Estimator:
         return user_estimator(model)
     if model not in selectable_models():
         raise ValueError(
-            f'correction model is one of {", ".join(selectable_models())}, not {model!r}'
+            f'correction model must be one of {", ".join(selectable_models())}, not {model!r}'
         )
     if model in ESTIMATORS:
         return ESTIMATORS[model]

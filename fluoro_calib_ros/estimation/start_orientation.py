@@ -57,8 +57,8 @@ DISTANCES = (0.5, 30.0)
 
 UNTILTED = Finding(
     Kind.UNTILTED_TARGETS,
-    'the targets are flat and not tilted, so that the principal distance cannot be found',
-    advice='tilt the target by 20 degrees and more, or give the principal distance',
+    'the targets are flat and not tilted: the principal distance is undetermined',
+    advice='tilt the target by 20 degrees or more, or give the principal distance',
 )
 
 
@@ -156,14 +156,14 @@ def _starts(view: View, interior: NDArray[np.float64]) -> list[Callable[[], Rese
 
 
 def settle_planes(
-    views: Sequence[View], found: Sequence[Resection | None], interior: np.ndarray
+    views: Sequence[View], resections: Sequence[Resection | None], interior: np.ndarray
 ) -> list[Resection | None]:
     """Return resections in which views of planes have the better of their two poses.
 
     Distortion bends a plane like a tilt, but is the same in all exposures. The estimation
     alternates between a preliminary correction of all residuals and the poses with it.
     """
-    out = list(found)
+    out = list(resections)
     if not any(view.is_flat and resection is not None for view, resection in zip(views, out)):
         return out
     for _ in range(ROUNDS):
@@ -190,13 +190,13 @@ def _better_pose(view: View, present: Resection, interior: NDArray[np.float64]) 
 
 
 def _preliminary_correction(
-    views: Sequence[View], found: Sequence[Resection | None], interior: NDArray[np.float64]
+    views: Sequence[View], resections: Sequence[Resection | None], interior: NDArray[np.float64]
 ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """Return a polynomial correction fitted robustly to the residuals of all views."""
     functions = Functions(views[0].frame.image_size, CUBIC)
     pixels = []
     residuals = []
-    for view, resection in zip(views, found):
+    for view, resection in zip(views, resections):
         if resection is None:
             continue
         predicted = project(resection.rotation, resection.position_mm, view.xyz, interior)

@@ -148,7 +148,9 @@ class MeasuredDistance:
         if self.first == self.second:
             raise DataError('both ends are the same bead', place=place)
         if not (0 < self.length_mm < np.inf and 0 < self.sd_mm < np.inf):
-            raise DataError('length and standard deviation are numbers above 0', place=place)
+            raise DataError(
+                'length and standard deviation must be finite and above 0', place=place
+            )
 
     @property
     def name(self) -> str:
@@ -201,7 +203,7 @@ class SurveyedBeads:
 
 
 def surveyed_beads(
-    result: CalibrationResult, given: Phantom, distances: Sequence[MeasuredDistance] = ()
+    result: CalibrationResult, initial: Phantom, distances: Sequence[MeasuredDistance] = ()
 ) -> SurveyedBeads:
     """Return the beads of a joint calibration with inner constraints, at a measured scale.
 
@@ -209,9 +211,9 @@ def surveyed_beads(
     """
     (solved,) = result.solved.values()
     targets = result.targets
-    row = given.index(targets.target_id)
-    given_mm = given.xyz_mm[row]
-    given_sd = given.sd_mm[row]
+    row = initial.index(targets.target_id)
+    given_mm = initial.xyz_mm[row]
+    given_sd = initial.sd_mm[row]
     network = solved.measured.network
     in_datum = slice(None) if network.in_datum is None else network.in_datum
     centre = targets.xyz_mm[in_datum].mean(axis=0)
@@ -257,8 +259,8 @@ def _rows(distances: Sequence[MeasuredDistance], target_id: NDArray[np.int64]) -
         for end in (distance.first, distance.second):
             if end not in target_id:
                 raise DataError(
-                    f'bead {end} is not found from the images: it is not on the phantom, or too '
-                    'few exposures show it',
+                    f'bead {end} cannot be located from the images: it is not on the phantom, or '
+                    'too few exposures show it',
                     kind=Kind.FEW_RAYS,
                     place=Place(target_id=(end,), name=distance.name),
                 )

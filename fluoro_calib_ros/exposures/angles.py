@@ -162,7 +162,7 @@ class AngleTrack:
                 f'angle_max_age, {self._max_age_ns * 1e-9:g} s'
             )
         if math.isnan(self._angles[index]):
-            return f'its position is no angle between -{MAX_ANGLE:.2f} and {MAX_ANGLE:.2f} rad'
+            return f'its position is not an angle between -{MAX_ANGLE:.2f} and {MAX_ANGLE:.2f} rad'
         return ''
 
     def _clear(self) -> None:

@@ -113,7 +113,7 @@ class ExposureCollector:
         if max_displacement > self.still.still_px:
             return 'the phantom moves'
         if self._streaming and span < still_ns / 2:
-            return 'too few frames to tell whether the phantom stands still'
+            return 'too few frames to decide whether the phantom stands still'
         for exposure in self.exposures:
             if self._displacement(pair, exposure) < self.still.new_px:
                 return 'this pose of the phantom is already collected'
@@ -193,7 +193,8 @@ class ExposureCollector:
         for name in wanted:
             if name not in self.fluoroscopes:
                 raise DataError(
-                    f'fluoroscope {name} is unknown, there are {", ".join(self.fluoroscopes)}'
+                    f'fluoroscope {name} is unknown, expected one of '
+                    f'{", ".join(self.fluoroscopes)}'
                 )
         return {
             name: [pair[name] for pair in self.exposures]
@@ -315,7 +316,7 @@ def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
     areas = coverage.missing_areas[:MAX_AREAS]
     covered = coverage.fraction_of_field >= RECOMMENDED_COVERAGE
     if exposures >= RECOMMENDED_EXPOSURES and covered:
-        corners = '; if the field of view is not round, show beads in the corners, too'
+        corners = '; if the field of view is not round, also show beads in the corners'
         return Readiness(True, f'ready to calibrate{corners if coverage.is_round else ""}')
     remaining = RECOMMENDED_EXPOSURES - exposures
     count = f'{remaining} more, ' if remaining > 0 else ''

@@ -95,7 +95,7 @@ def _decided(frame: Frame, decisions: Sequence[PointDecision]) -> tuple[Frame | 
         cause = next((d for d in decisions if d.new_id == repeated_id), decisions[0])
         raise DataError(
             f'{cause.where}: exposure {frame.number} then has target {repeated_id} twice; decide '
-            'on the other image point, too'
+            'on the other image point as well'
         )
     sigma = None if frame.sigma is None else frame.sigma[keep]
     changed = replace(frame, target_id=ids[keep], uv=frame.uv[keep], sigma=sigma)

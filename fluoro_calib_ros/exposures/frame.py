@@ -253,7 +253,7 @@ def _image_error(
     if inside.all():
         return ''
     width, height = image_size
-    return f'target {ids[~inside][0]} is off the image of {width} x {height} px'
+    return f'target {ids[~inside][0]} is outside the image of {width} x {height} px'
 
 
 def _phantom_error(ids: NDArray[np.int64], phantom: Phantom) -> str:
@@ -376,11 +376,11 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
     causes = [
         f'target {first_few(ids[mask])} {cause}'
         for mask, cause in (
-            (off_image & single_stray, 'off the image'),
+            (off_image & single_stray, 'outside the image'),
             (off_phantom & single_stray & ~off_image, 'not on the phantom'),
             (
                 coincident,
-                'at the image point of others, a fill value for targets that are not seen',
+                'at the same image point as others, a fill value for targets that are not seen',
             ),
         )
         if mask.any()

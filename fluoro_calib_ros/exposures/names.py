@@ -60,10 +60,10 @@ class Names:
         return {identity: name for name, identity in self.fluoroscopes.items()}
 
 
-def _merged(what: str, one: Mapping[str, object], other: Mapping[str, object]) -> dict[str, Any]:
+def _merged(noun: str, one: Mapping[str, object], other: Mapping[str, object]) -> dict[str, Any]:
     for name, identity in other.items():
         if one.get(name, identity) != identity:
-            raise DataError(f'{what} {name!r} has the id {one[name]}, and the id {identity}')
+            raise DataError(f'{noun} {name!r} has the id {one[name]}, and the id {identity}')
     return {**one, **other}
 
 

@@ -57,7 +57,8 @@ class PairingOptions:
     )
     patience: int = option(
         PATIENCE,
-        'frames of two others for which a silent one of three or more fluoroscopes is awaited',
+        'with three or more fluoroscopes: frames of two others after which a silent one is given '
+        'up',
         minimum=1,
         maximum=10000,
     )
@@ -71,7 +72,7 @@ class PairingOptions:
     def by_number(self) -> bool:
         """Whether frames are paired by number. Raises ValueError for an unknown pair_by."""
         if self.pair_by not in PAIR_BY:
-            raise ValueError(f"pair_by is 'frame_number' or 'stamp', not {self.pair_by!r}")
+            raise ValueError(f"pair_by must be 'frame_number' or 'stamp', not {self.pair_by!r}")
         return self.pair_by == 'frame_number'
 
 

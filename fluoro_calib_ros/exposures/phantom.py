@@ -98,7 +98,7 @@ def _validate(ids: NDArray[np.int64], xyz: NDArray[np.float64], sd: NDArray[np.f
         ('sd', is_positive(sd)),
     ):
         if not valid.all():
-            raise DataError(f'phantom: target {ids[~valid][0]} has a wrong {name}')
+            raise DataError(f'phantom: target {ids[~valid][0]} has an invalid {name}')
     repeated = first_repeated(ids)
     if repeated is not None:
         raise DataError(f'phantom: target {ids[repeated[0]]} is given twice')
@@ -115,7 +115,7 @@ def require_size(phantom: Phantom) -> None:
         return
     units = [unit for unit, mm in UNITS_MM.items() if low <= extent * mm <= high]
     if not units:
-        cause = 'this is no phantom'
+        cause = 'this is not a phantom'
     else:
         cause = f'the coordinates are in {units[0]}, not in mm, or in another unit'
     raise DataError(
@@ -156,9 +156,9 @@ class Drawing:
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows, self.layers) < 1:
-            raise DataError('a drawing has one column, row and layer at least', kind=Kind.DATA)
+            raise DataError('a drawing needs at least one column, row and layer', kind=Kind.DATA)
         if not all(0 < pitch < np.inf for pitch in self.pitch_mm):
-            raise DataError('a pitch is a number of mm above 0', kind=Kind.IMPLAUSIBLE_NUMBER)
+            raise DataError('a pitch must be above 0 mm', kind=Kind.IMPLAUSIBLE_NUMBER)
         nearest = min(self.pitch_mm[: 1 if self.hexagonal else 3 if self.layers > 1 else 2])
         if self.diameter_mm is not None and not 0 < self.diameter_mm < nearest:
             raise DataError(
@@ -178,7 +178,7 @@ class Drawing:
                 1 <= row <= self.rows and 1 <= column <= self.columns and 1 <= layer <= self.layers
             ):
                 raise DataError(
-                    f'the blocked place {",".join(map(str, place))} is not on the drawing of '
+                    f'the blocked position {",".join(map(str, place))} is outside the drawing of '
                     f'{self.rows} rows, {self.columns} columns and {self.layers} layers'
                 )
             ids.append(((layer - 1) * self.rows + row - 1) * self.columns + column)

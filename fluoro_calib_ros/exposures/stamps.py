@@ -88,8 +88,8 @@ class StampAgreement:
         count = typical / interval
         return (
             f'frames of {one} and {other} with the same number are {typical * 1e-6:.1f} ms apart '
-            f'({count:.1f} frame intervals): they are of different exposures, or the clocks of '
-            'the cameras differ; start the cameras together, or pair frames by stamp'
+            f'({count:.1f} frame intervals): they belong to different exposures, or the clocks '
+            'of the cameras differ; start the cameras together, or pair frames by stamp'
         )
 
 

@@ -27,7 +27,7 @@ from .rig_adjustment import (
     RigAdjustment,
     RigSolution,
 )
-from .sizes import Sizes, Told, parts_of_drift, parts_of_interior, parts_of_knock
+from .sizes import ChangeStatistics, Sizes, parts_of_drift, parts_of_interior, parts_of_knock
 
 MAX_CAUSES = 3
 # The search for causes ends if the probability of no further change exceeds 1 - SURE.
@@ -78,12 +78,14 @@ class Diagnosis:
     prior: Prior
     solution: RigSolution
     noise: float  #: factor by which image points scatter more than claimed, at least 1
-    rest: float  #: probability of no other change; 0 if more causes were not tried
+    no_further_probability: (
+        float  #: probability of no other change; 0 if more causes were not tried
+    )
 
     @property
     def complete(self) -> bool:
         """Whether no other cause has to be searched for."""
-        return self.rest > 1 - SURE
+        return self.no_further_probability > 1 - SURE
 
     @property
     def sure(self) -> bool:
@@ -161,7 +163,7 @@ class Diagnostician:
             best.prior,
             solution=best.solution,
             noise=_noise(best.solution),
-            rest=p_no_further,
+            no_further_probability=p_no_further,
         )
 
     # -- hypotheses
@@ -213,14 +215,14 @@ class Diagnostician:
         solution takes most image points of a pose for false matches: these have no weight in the
         derivatives.
         """
-        statistics = self.adjustment.told(best.observed, best.prior, best.solution)
+        statistics = self.adjustment.change_statistics(best.observed, best.prior, best.solution)
         is_lost = (best.solution.inliers_of_pose < FITS).any()  # due to a change, hardly by chance
         places = self._of_rig()
         places += [Change(Cause.MIGRATED, body=b, markers=(m,)) for b, m in self._markers]
         gains = [
             (self._sizes(statistics, place).evidence, place)
             for place in places
-            if place not in best.changes and not _is_told(place, best.changes)
+            if place not in best.changes and not _is_implied(place, best.changes)
         ]
         gains.sort(key=lambda entry: -entry[0])
         if not gains or (gains[0][0] <= 0 and not is_lost):
@@ -245,7 +247,7 @@ class Diagnostician:
             n = float(freedom[rows].sum())
             s2 = max(1.0, float(squares[rows].sum()) / max(n, 1.0))
             gain = 0.5 * n * (s2 - 1 - np.log(s2)) - 0.5 * np.log(max(n, 1.0))
-            is_explained = change in best.changes or _is_told(change, best.changes)
+            is_explained = change in best.changes or _is_implied(change, best.changes)
             if not is_explained and gain > max(0.0, out.get(change.cause, (0.0,))[0]):
                 out[change.cause] = gain, change
         return [change for _, change in out.values()]
@@ -283,11 +285,13 @@ class Diagnostician:
         if not len(rows):
             return hypothesis
         sd = np.zeros(self.adjustment.size)
-        sd[rows] = self._sizes(self.adjustment.told(observed, prior, solution), change).rms
+        sd[rows] = self._sizes(
+            self.adjustment.change_statistics(observed, prior, solution), change
+        ).rms
         widened = prior.widened(sd)
         start = solution.values, solution.poses
         solution = self.adjustment.refine(observed, widened, start)
-        statistics = self.adjustment.told(observed, prior, solution)
+        statistics = self.adjustment.change_statistics(observed, prior, solution)
         by_size = self._sizes(statistics, change).evidence - float(
             statistics.only(rows).evidence(sd[rows])
         )
@@ -305,9 +309,9 @@ class Diagnostician:
         """Return the unknowns (k,) that a change affects."""
         return np.flatnonzero(self.sd_of(change))
 
-    def _sizes(self, told: Told, change: Change) -> Sizes:
+    def _sizes(self, statistics: ChangeStatistics, change: Change) -> Sizes:
         rows = self.rows_of(change)
-        return told.only(rows).sizes(self.parts_of(change)[:, rows])
+        return statistics.only(rows).sizes(self.parts_of(change)[:, rows])
 
     def sd_of(self, change: Change) -> NDArray[np.float64]:
         """Return standard deviations (K,) of the unknowns for a change of the usual size."""
@@ -353,7 +357,7 @@ class Diagnostician:
         return out
 
 
-def _is_told(change: Change, changes: Sequence[Change]) -> bool:
+def _is_implied(change: Change, changes: Sequence[Change]) -> bool:
     """Return whether a change of a marker is part of another one: soft body or loose marker."""
     return change.body >= 0 and any(
         earlier.body == change.body

@@ -116,7 +116,7 @@ def _of_unseen_knocks(diagnostician: Diagnostician, diagnosis: Diagnosis) -> NDA
     sd = np.linalg.norm([diagnostician.sd_of(knock) for knock in diagnostician.knocks()], axis=0)
     rows = np.flatnonzero(sd)
     fixed_prior = replace(diagnosis.prior, orientation=np.zeros_like(calibrated))
-    statistics = adjustment.told(diagnosis.observed, fixed_prior, diagnosis.solution)
+    statistics = adjustment.change_statistics(diagnosis.observed, fixed_prior, diagnosis.solution)
     out = calibrated.copy()
     moments = statistics.only(rows).with_noise(diagnosis.noise).mean_moments(sd[None, rows])
     out[np.ix_(rows, rows)] += moments
@@ -148,7 +148,7 @@ def _unseen_drift(
     known = np.zeros(adjustment.size)
     known[adjustment.rig] = held
     fixed_prior = replace(diagnosis.prior, orientation=no_covariance, sd=sd)
-    statistics = adjustment.told(observed, fixed_prior, diagnosis.solution, known)
+    statistics = adjustment.change_statistics(observed, fixed_prior, diagnosis.solution, known)
     parts = diagnostician.parts_of(Change(Cause.DISTORTION, fluoroscope))[:, columns]
     moments = statistics.only(columns).with_noise(diagnosis.noise).mean_moments(parts, smooth)
     functions = adjustment.functions[fluoroscope]

@@ -34,36 +34,36 @@ STEPS = 4  # iterations with the trusted image points, and as many with all
 
 
 def with_best_modes(
-    adjustment: RigAdjustment, observed: ObservedBodies, prior: Prior, found: RigSolution
+    adjustment: RigAdjustment, observed: ObservedBodies, prior: Prior, initial: RigSolution
 ) -> RigSolution:
     """Return a solution with the likeliest poses in exposures with several false matches.
 
     From the pose of the nearest exposure without these, each image point and, for bodies with few,
     each pair of them is excluded once, and the pose with the largest likelihood is taken.
     """
-    has_false = observed.seen.sum(axis=(2, 3)) * (1 - found.inliers_of_pose) > 1.5
+    has_false = observed.seen.sum(axis=(2, 3)) * (1 - initial.inliers_of_pose) > 1.5
     exposures = np.flatnonzero(has_false.any(axis=1))
     if not len(exposures) or has_false.mean() > BY_CHANCE:
-        return found
+        return initial
     excluded = _choices(observed.seen.shape[2:])
     rows = np.tile(exposures, len(excluded))
     repeated = observed.exposures(rows)
     trusted = repeated.seen & np.repeat(~excluded, len(exposures), axis=0)[:, None]
-    start = _from_neighbours(found.poses, has_false).exposures(rows)
-    poses = _posed(adjustment, repeated, prior, (found.values, start), trusted)
-    loss = _loss(adjustment, repeated, prior, (found.values, poses))
+    start = _from_neighbours(initial.poses, has_false).exposures(rows)
+    poses = _posed(adjustment, repeated, prior, (initial.values, start), trusted)
+    loss = _loss(adjustment, repeated, prior, (initial.values, poses))
     best = np.argmin(loss.reshape(len(excluded), len(exposures), -1), axis=0)
     best = best * len(exposures) + np.arange(len(exposures))[:, None]
-    before = _loss(adjustment, observed, prior, (found.values, found.poses))[exposures]
+    before = _loss(adjustment, observed, prior, (initial.values, initial.poses))[exposures]
     is_better = has_false[exposures] & (np.take_along_axis(loss, best, axis=0) < before)
-    rotation, centre = found.poses.rotation.copy(), found.poses.centre_mm.copy()
+    rotation, centre = initial.poses.rotation.copy(), initial.poses.centre_mm.copy()
     row, body = np.nonzero(is_better)
     improved = exposures[row], body
     rotation[improved] = poses.rotation[best[row, body], body]
     centre[improved] = poses.centre_mm[best[row, body], body]
-    restart = Poses(rotation, centre, found.poses.known)
-    refined = adjustment.refine(observed, prior, (found.values, restart))
-    return max(found, refined, key=lambda solution: solution.evidence)
+    restart = Poses(rotation, centre, initial.poses.known)
+    refined = adjustment.refine(observed, prior, (initial.values, restart))
+    return max(initial, refined, key=lambda solution: solution.evidence)
 
 
 def _choices(shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -118,12 +118,14 @@ def _loss(
     adjustment: RigAdjustment,
     observed: ObservedBodies,
     prior: Prior,
-    found: tuple[NDArray[np.float64], Poses],
+    estimate: tuple[NDArray[np.float64], Poses],
 ) -> NDArray[np.float64]:
     """Return minus twice the log likelihood (T, B) of poses.
 
     Image points of markers behind a source count as false.
     """
-    terms = Mixture.of(adjustment, LinearPoints.of(adjustment, observed, *found), observed, prior)
+    terms = Mixture.of(
+        adjustment, LinearPoints.of(adjustment, observed, *estimate), observed, prior
+    )
     losses = np.where(terms.good, terms.losses, -2 * np.log(terms.false))
     return np.asarray(np.where(observed.seen, losses, 0.0).sum(axis=(2, 3)))

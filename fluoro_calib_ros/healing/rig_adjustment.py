@@ -39,7 +39,7 @@ from ..correction.terms import CUBIC
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from ..photogrammetry.unknowns import POSE_SIZE
-from .sizes import Told
+from .sizes import ChangeStatistics
 
 FALSE_SHARE = 0.01  # expected share of false matches among the image points
 MAX_STEPS = 20
@@ -305,13 +305,13 @@ class RigAdjustment:
         normal = self.normal_of(linear, weight, np.ones(self.size, dtype=bool))
         return normal.matrix, normal.right
 
-    def told(
+    def change_statistics(
         self,
         observed: ObservedBodies,
         prior: Prior,
         solution: RigSolution,
         known: NDArray[np.float64] | float = 0.0,
-    ) -> Told:
+    ) -> ChangeStatistics:
         """Return the information of the data on changes of the unknowns (K,) beyond a prior.
 
         The solution may be that of another prior. known (K,): changes that are certain.
@@ -321,7 +321,7 @@ class RigAdjustment:
         root = self.root(prior)
         whitened = np.eye(root.shape[1]) + root.T @ normal @ root
         system -= normal @ root @ np.linalg.solve(whitened, root.T @ system)
-        return Told((system[:, :-1] + system[:, :-1].T) / 2, system[:, -1])
+        return ChangeStatistics((system[:, :-1] + system[:, :-1].T) / 2, system[:, -1])
 
     def covariance_at(
         self, observed: ObservedBodies, prior: Prior, solution: RigSolution

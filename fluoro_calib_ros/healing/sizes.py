@@ -33,7 +33,7 @@ MANY = 3  # number of parts of a change from which on only every second size is 
 
 
 @dataclass(frozen=True)
-class Told:
+class ChangeStatistics:
     """Information of the data on the unknowns of a change, all other unknowns being eliminated.
 
     Normal equations M (k, k), m (k,) about no change. With the covariance V of the change, its log
@@ -44,13 +44,13 @@ class Told:
     matrix: NDArray[np.float64]
     right: NDArray[np.float64]
 
-    def only(self, rows: NDArray[np.int64]) -> Told:
+    def only(self, rows: NDArray[np.int64]) -> ChangeStatistics:
         """Return the information on some of the unknowns (k,), with no change of the others."""
-        return Told(self.matrix[np.ix_(rows, rows)], self.right[rows])
+        return ChangeStatistics(self.matrix[np.ix_(rows, rows)], self.right[rows])
 
-    def with_noise(self, factor: float) -> Told:
+    def with_noise(self, factor: float) -> ChangeStatistics:
         """Return the information if the data scatter more than claimed, by a factor."""
-        return Told(self.matrix / factor**2, self.right / factor**2)
+        return ChangeStatistics(self.matrix / factor**2, self.right / factor**2)
 
     def evidence(self, sd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the log evidence (...,) of standard deviations (..., k)."""

@@ -54,7 +54,7 @@ def decode(content: bytes | bytearray | memoryview | NDArray[np.uint8]) -> np.nd
         if is_png:
             _check_png(data.data)  # reports what is damaged
         # OpenCV decodes more formats, but their size is unknown before they are decoded.
-        raise DataError('this is no image that can be decoded, or it is damaged')
+        raise DataError('this is not an image that can be decoded, or it is damaged')
     check_declared_size(data.data)
     if is_png:
         _check_png(data.data)
@@ -65,7 +65,7 @@ def decode(content: bytes | bytearray | memoryview | NDArray[np.uint8]) -> np.nd
     except cv2.error:
         image = None
     if image is None:
-        raise DataError('this is no image that can be decoded, or it is damaged')
+        raise DataError('this is not an image that can be decoded, or it is damaged')
     return as_grey(image)
 
 

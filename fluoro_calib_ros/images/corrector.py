@@ -100,7 +100,8 @@ class ImageCorrector:
     ) -> None:
         if interpolation not in INTERPOLATIONS:
             raise DataError(
-                f'the interpolation is one of {", ".join(INTERPOLATIONS)}, not {interpolation!r}'
+                f'the interpolation must be one of {", ".join(INTERPOLATIONS)}, not '
+                f'{interpolation!r}'
             )
         if max(calibration.image_size) > MAX_IMAGE_SIDE:
             raise DataError(

@@ -116,7 +116,7 @@ def likely_detections(image: np.ndarray, beads: int) -> Iterator[Detections]:
     # If an image shows fewer beads than expected, the strongest blob determines their size.
     for trial in (sight, replace(sight, typical=1)):
         count = 0
-        for scale, inverted in trial.looks(whole=beads < MANY):
+        for scale, inverted in trial.looks(whole_image=beads < MANY):
             detections = trial.detections(scale, inverted)
             if detections is not None:
                 count += 1
@@ -151,9 +151,9 @@ class _Sight:
         height, width = self.grey.shape
         return self.grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
 
-    def looks(self, whole: bool = True) -> list[tuple[float, bool]]:
+    def looks(self, whole_image: bool = True) -> list[tuple[float, bool]]:
         """Return scales and polarities of the strongest blobs, strongest first."""
-        looks = [] if whole else self.likely(self.middle())
+        looks = [] if whole_image else self.likely(self.middle())
         looks = sorted(looks or self.likely(self.grey), reverse=True)
         return [(scale, inverted) for _, scale, inverted in looks]
 
@@ -342,15 +342,15 @@ def _nothing(image: np.ndarray, sight: _Sight) -> DataError:
         share = np.count_nonzero(image == value) / image.size
         if share > 0.5:
             cause = (
-                f'there are no beads in the image, {share:.0%} of it are {text} '
-                f'(grey value {value:.0f})'
+                f'there are no beads in the image, {share:.0%} of it is {text} (grey value '
+                f'{value:.0f})'
             )
             return DataError(cause, kind=Kind.IMAGE_EMPTY, numbers={'share': share})
     contrast = sight.contrast()
-    cause = 'there are no beads in the image, nothing round rises above the noise'
+    cause = 'there are no beads in the image, no round shadow rises above the noise'
     if contrast:
         cause = (
-            'there are no beads in the image: the contrast of what is round in it is at most '
+            'there are no beads in the image: the contrast of its round shadows is at most '
             f'{contrast:.1%}, at least {MIN_CONTRAST:.0%} are needed'
         )
     return DataError(cause, kind=Kind.FEW_BEADS, numbers={'contrast': contrast})

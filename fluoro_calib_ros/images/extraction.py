@@ -43,10 +43,10 @@ MIN_ACCEPTED = 0.5  # least share of the matched beads that are measured well
 MIN_SCATTER_PX = 0.05
 # Reasons why predicted beads are not observed, without a number.
 LOST = Finding(Kind.BEAD_LOST, 'cut off, or lost while it was measured')
-DISTURBED = Finding(Kind.BEAD_DISTURBED, 'something else is beside it')
+DISTURBED = Finding(Kind.BEAD_DISTURBED, 'another object is next to it')
 HIDDEN = Finding(Kind.BEAD_HIDDEN, 'hidden by another bead')
 VAGUE = (Kind.BEAD_UNSURE, Kind.BEAD_HIDDEN)
-ALONE = Finding(Kind.BEAD_ALONE, 'its neighbours are not found')
+ALONE = Finding(Kind.BEAD_ALONE, 'its neighbours were not found')
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
         if found is None:
             return None
         followed = _measured(
-            detections, seen, found=found, model=model, imaging=near.imaging, passes=(STEPS,)
+            detections, seen, matched=found, model=model, imaging=near.imaging, passes=(STEPS,)
         )
     except DataError:
         return None
@@ -174,16 +174,16 @@ def _seen(detections: Detections, model: PhantomModel) -> Seen:
 def _measured(
     detections: Detections,
     seen: Seen,
-    found: Match,
+    matched: Match,
     model: PhantomModel,
     imaging: Imaging | None = None,
     passes: tuple[int, ...] = (FIRST_STEPS, STEPS),
 ) -> Extraction:
     """Measure all predicted beads, by default twice: the second time from a better prediction."""
-    view = found.view
-    predicted = found.predicted
-    bead = found.bead
-    uv = seen.uv[found.detection]
+    view = matched.view
+    predicted = matched.predicted
+    bead = matched.bead
+    uv = seen.uv[matched.detection]
     light = detections.light
     for steps in passes:
         rows = np.flatnonzero(seen.in_field(predicted))
@@ -207,13 +207,13 @@ def _measured(
         reasons = _reasons(beads, predicted[rows])
         reasons = [reason if known else HIDDEN for reason, known in zip(reasons, sized)]
         good = np.array([reason is None for reason in reasons], dtype=bool)
-        if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(found.bead)):
+        if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(matched.bead)):
             measured_well = int(np.count_nonzero(good))
             raise DataError(
-                f'the phantom is found with {len(found.bead)} beads, of which only '
+                f'the phantom is found with {len(matched.bead)} beads, of which only '
                 f'{measured_well} can be measured',
                 kind=Kind.BEADS_NOT_MEASURED,
-                numbers={'beads': len(found.bead), 'measured': measured_well},
+                numbers={'beads': len(matched.bead), 'measured': measured_well},
             )
         bead = rows[good]
         uv = beads.uv[good]
@@ -229,7 +229,7 @@ def _measured(
         predicted = view.project(model.xyz) + nearby.value
         measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
     assert imaging is not None
-    extraction = _checked(detections, found, view, measured, imaging)
+    extraction = _checked(detections, matched, view, measured, imaging)
     extraction = _with_support(extraction, model, rows)
     # The fit measures the centres of shadows; observations are the projected centres of beads.
     radius_px = imaging.profile.border_px * (shadows.radius * size)
@@ -272,7 +272,7 @@ def _away(measured: _Measured) -> NDArray[np.bool_]:
 
 def _checked(
     detections: Detections,
-    found: Match,
+    matched: Match,
     view: View,
     measured: _Measured,
     imaging: Imaging,
@@ -282,13 +282,13 @@ def _checked(
     reasons = list(measured.reasons)
     for number in np.flatnonzero(_away(measured)):
         off = float(measured.residual[number])
-        cause = f'{off:.2f} px from where its neighbours say'
+        cause = f'{off:.2f} px from the prediction of its neighbours'
         reasons[number] = Finding(Kind.BEAD_AWAY, cause, numbers={'off_px': off})
     good = np.array([reason is None for reason in reasons], dtype=bool)
     usual = float(np.median(beads.sigma[good]))
     vague = good & (beads.sigma > max(SURE_SIGMA_PX, MAX_SIGMAS * usual))
     for number in np.flatnonzero(vague):
-        cause = f'sigma {beads.sigma[number]:.2f} px, that of most is {usual:.2f} px'
+        cause = f'sigma {beads.sigma[number]:.2f} px, that of most beads is {usual:.2f} px'
         reasons[number] = Finding(
             Kind.BEAD_UNSURE, cause, numbers={'sigma_px': float(beads.sigma[number])}
         )
@@ -306,7 +306,7 @@ def _checked(
         refused=refused,
         view=view,
         detections=detections,
-        match=found,
+        match=matched,
         imaging=imaging,
     )
 
@@ -421,7 +421,7 @@ def _reasons(beads: Beads, predicted: NDArray[np.float64]) -> list[Finding | Non
         if not beads.measured[number]:
             reason = LOST
         elif not DEPTH[0] < depth < DEPTH[1]:
-            cause = f'a shadow of {depth:.0%} of that of a bead'
+            cause = f'a contrast of {depth:.0%} of that of a bead'
             reason = Finding(Kind.BEAD_CONTRAST, cause, numbers={'depth': depth})
         elif beads.misfit[number] > MAX_MISFIT:
             reason = DISTURBED

@@ -65,16 +65,16 @@ def follow(
     return None
 
 
-def _fits(found: Match | None, limit_px: float) -> bool:
+def _fits(matched: Match | None, limit_px: float) -> bool:
     """Return whether a match is evident, with residuals as small as before.
 
     If the phantom had turned by nearly one of its symmetries, residuals would be larger.
     """
     return (
-        found is not None
-        and is_evident(found)
-        and found.scale_px < limit_px
-        and len(found.bead) >= MIN_BEADS
+        matched is not None
+        and is_evident(matched)
+        and matched.scale_px < limit_px
+        and len(matched.bead) >= MIN_BEADS
     )
 
 

@@ -263,14 +263,14 @@ def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.b
 
 
 def _good_cells(
-    uv: NDArray[np.float64], found: NDArray[np.bool_], shape: tuple[int, ...]
+    uv: NDArray[np.float64], detected: NDArray[np.bool_], shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
     """Return (n,) whether most predicted beads (n, 2) of the same region are found."""
     height, width = shape
     cell = (np.clip(uv / (width, height), 0, 0.999) * CELLS).astype(int)
     number = cell[:, 0] * CELLS + cell[:, 1]
     total = np.bincount(number, minlength=CELLS * CELLS)
-    hits = np.bincount(number, weights=found, minlength=CELLS * CELLS)
+    hits = np.bincount(number, weights=detected, minlength=CELLS * CELLS)
     bad_cell = (total >= MIN_CELL) & (hits < 0.6 * total)
     return ~bad_cell[number]
 

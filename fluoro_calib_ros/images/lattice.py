@@ -40,9 +40,8 @@ STEPS = 3  # number of steps of the refinement
 # Note on images of a grid of which any place is accepted.
 NOT_MARKED = Finding(
     Kind.GRID_NOT_MARKED,
-    'the grid is taken as one without marks: ids count from the hole nearest to the middle of '
-    'each image',
-    advice='this serves the distortion of one fluoroscope, not the orientation of two',
+    'the grid is treated as unmarked: ids count from the hole nearest to the centre of each image',
+    advice='this suffices for the distortion of one fluoroscope, not for the orientation of two',
     severity=Severity.NOTE,
 )
 
@@ -237,19 +236,19 @@ def _changes() -> Iterator[NDArray[np.int64]]:
 
 
 def _shifts(
-    found: NDArray[np.int64],
+    indices: NDArray[np.int64],
     missing: NDArray[np.int64],
     grid: NDArray[np.int64],
     wanted: np.ndarray,
 ) -> list[tuple[NDArray[np.int64], int]]:
-    """Return shifts (2,) of indices found (n, 2) onto a grid (m, 2), with their contradictions.
+    """Return shifts (2,) of indices (n, 2) onto a grid (m, 2), with their contradictions.
 
     Shifts with equally many are in order of their distance from a wanted shift (2,).
     """
-    found_corner = found.min(axis=0)
+    found_corner = indices.min(axis=0)
     grid_corner = grid.min(axis=0)
     grid_raster = _raster(grid - grid_corner)
-    found_raster = _raster(found - found_corner)
+    found_raster = _raster(indices - found_corner)
     missing_raster = np.zeros_like(found_raster)
     missing_raster[tuple((missing - found_corner).T)] = 1
     shape = tuple(np.array(grid_raster.shape) + found_raster.shape - 1)
@@ -261,7 +260,7 @@ def _shifts(
     distance = np.hypot(i + start[0] - wanted[0], j + start[1] - wanted[1])
     best = np.lexsort((distance.ravel(), -overlap.ravel()))[:SHIFTS]
     return [
-        (np.array(place) + start, len(found) - int(overlap[tuple(place)]))
+        (np.array(place) + start, len(indices) - int(overlap[tuple(place)]))
         for place in np.column_stack(np.unravel_index(best, overlap.shape))
     ]
 

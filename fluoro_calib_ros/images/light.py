@@ -81,10 +81,10 @@ def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:
     return low, high
 
 
-def _is_clipped(grey: NDArray[np.floating], outermost: float, beside: float) -> bool:
+def _is_clipped(grey: NDArray[np.floating], outermost: float, neighbour: float) -> bool:
     """Return whether an outermost grey value is more frequent than its neighbour."""
     count = int(np.count_nonzero(grey == outermost))
-    return count > max(int(np.count_nonzero(grey == beside)), MIN_CLIPPED)
+    return count > max(int(np.count_nonzero(grey == neighbour)), MIN_CLIPPED)
 
 
 @dataclass(frozen=True)

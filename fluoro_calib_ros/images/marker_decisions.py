@@ -113,47 +113,47 @@ class DecidedView:
         return Decision('dropped', self.name, frame, since, ids)
 
     def revised(
-        self, found: MarkerFrame, decisions: Sequence[Decision], frame: int
+        self, markers: MarkerFrame, decisions: Sequence[Decision], frame: int
     ) -> MarkerFrame:
         """Return the markers of the view after all decisions, with the remaining doubts."""
         for decision in decisions:
             if decision.fluoroscope == self.name and decision.since <= frame:
-                found = revise(found, decision)
-        return replace(found, doubtful=np.isin(found.target_id, self.tracker.doubtful()))
+                markers = revise(markers, decision)
+        return replace(markers, doubtful=np.isin(markers.target_id, self.tracker.doubtful()))
 
 
-def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:
+def revise(markers: MarkerFrame, decision: Decision) -> MarkerFrame:
     """Return the markers of an image after a decision that applies to it."""
-    ids = found.target_id.copy()
-    doubtful = found.doubtful.copy()
+    ids = markers.target_id.copy()
+    doubtful = markers.doubtful.copy()
     if decision.kind == 'exchanged':
         first_id, second_id = decision.target_id
         # The exposure in which they were exchanged is unknown, so they stay doubtful.
-        doubtful |= np.isin(found.target_id, decision.target_id)
+        doubtful |= np.isin(markers.target_id, decision.target_id)
         ids = np.where(
-            found.target_id == first_id,
+            markers.target_id == first_id,
             second_id,
-            np.where(found.target_id == second_id, first_id, found.target_id),
+            np.where(markers.target_id == second_id, first_id, markers.target_id),
         )
-        return replace(found, target_id=ids, doubtful=doubtful)
-    row = found.target_id == decision.target_id[0]
+        return replace(markers, target_id=ids, doubtful=doubtful)
+    row = markers.target_id == decision.target_id[0]
     if decision.kind == 'confirmed':
         doubtful[row] = False
-        return replace(found, doubtful=doubtful)
+        return replace(markers, doubtful=doubtful)
     keep = ~row
-    missing = found.missing
-    predicted = found.predicted
-    lost = found.lost
+    missing = markers.missing
+    predicted = markers.predicted
+    lost = markers.lost
     if row.any():
         missing = np.append(missing, decision.target_id[0])
-        predicted = np.concatenate([predicted, found.uv[row]])
+        predicted = np.concatenate([predicted, markers.uv[row]])
         lost = np.append(lost, True)
     return replace(
-        found,
+        markers,
         target_id=ids[keep],
-        uv=found.uv[keep],
-        sigma=found.sigma[keep],
-        overlapped=found.overlapped[keep],
+        uv=markers.uv[keep],
+        sigma=markers.sigma[keep],
+        overlapped=markers.overlapped[keep],
         doubtful=doubtful[keep],
         missing=missing,
         predicted=predicted,
@@ -181,9 +181,9 @@ class EarlierImages:
     def __iter__(self) -> Iterator[MarkerFrame]:
         return iter(self._found)
 
-    def add(self, found: MarkerFrame) -> None:
+    def add(self, markers: MarkerFrame) -> None:
         """Keep the markers of an image."""
-        self._found.append(found)
+        self._found.append(markers)
 
     def revise(self, decision: Decision) -> list[Retraction]:
         """Apply a decision to the images that it covers; return the ids that it changes."""

@@ -291,10 +291,10 @@ class MarkerMeasurement:
         self._shutter = shutter
 
     def measure(
-        self, windows: LightWindows, found: Shadows, states: MarkerStates
+        self, windows: LightWindows, shadows: Shadows, states: MarkerStates
     ) -> MeasuredMarkers:
         """Measure the markers of an image in the shadows found in it."""
-        start, assigned, free = self._assign(found, states)
+        start, assigned, free = self._assign(shadows, states)
         self._share_shadows(start, assigned, states.motion)
         tried = np.flatnonzero(assigned)
         guess = MarkerGuess(
@@ -319,17 +319,17 @@ class MarkerMeasurement:
         )
 
     def _assign(
-        self, found: Shadows, states: MarkerStates
+        self, shadows: Shadows, states: MarkerStates
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
         """Return shadows or predictions (n, 2), whether each is a shadow, free shadows (k, 2)."""
         motion = states.motion
         variance = states.shadow_variance
-        row, column = assign(motion.uv, variance, found.uv, self._gate)
+        row, column = assign(motion.uv, variance, shadows.uv, self._gate)
         start = motion.uv.copy()
-        start[row] = found.uv[column]
+        start[row] = shadows.uv[column]
         assigned = np.zeros(len(start), dtype=bool)
         assigned[row] = True
-        return start, assigned, np.delete(found.uv, column, axis=0)
+        return start, assigned, np.delete(shadows.uv, column, axis=0)
 
     def _share_shadows(
         self, start: NDArray[np.float64], assigned: NDArray[np.bool_], motion: Motion

@@ -101,7 +101,7 @@ def identify_markers(
     names = list(orientation.fluoroscopes)
     bodies = identifiable(bodies)
     if not bodies:
-        raise DataError(f'there is no body with {MIN_MEMBERS} markers of known places')
+        raise DataError(f'there is no body with {MIN_MEMBERS} markers with known coordinates')
     rig = CalibratedRig(orientation, calibrations, angles or {})
     for name in names:
         check_image(images[name], calibrations[name].image_size)
@@ -231,7 +231,7 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
     if best.count < min_count:
         raise DataError(
             f'body {body.name}: its shape fits in more than one way in this exposure, its '
-            'distances do not tell the markers apart'
+            'distances do not distinguish the markers'
         )
     return best
 

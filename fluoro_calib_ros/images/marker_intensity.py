@@ -240,7 +240,7 @@ def _learn_look(
         elif best.clear:
             break  # beyond the size of the markers, the response decreases
     assert best is not None
-    return best.look('there is nothing round where the markers should be'), best.light
+    return best.look('there is no round shadow where the markers are expected'), best.light
 
 
 def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
@@ -252,15 +252,15 @@ def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
     best = max(
         (_Typical.strongest(light, count) for light in lights), key=lambda typical: typical.snr
     )
-    look = best.look('there are no markers in the image, nothing round rises above the noise')
-    return _found(look, best.light)
+    look = best.look('there are no markers in the image, no round shadow rises above the noise')
+    return _find_shadows(look, best.light)
 
 
 def search_image(image: np.ndarray, look: MarkerLook) -> Shadows:
     """Find shadows in a whole image that may be markers."""
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
-    return _found(look, _filtered(light, (2 * BACKGROUND_PX + 1,) * 2, look))
+    return _find_shadows(look, _filtered(light, (2 * BACKGROUND_PX + 1,) * 2, look))
 
 
 def _filtered(light: NDArray[np.float32], box: tuple[int, int], look: MarkerLook) -> FilteredLight:
@@ -329,7 +329,7 @@ class _Typical:
         )
 
 
-def _found(look: MarkerLook, light: FilteredLight) -> Shadows:
+def _find_shadows(look: MarkerLook, light: FilteredLight) -> Shadows:
     """Find the shadows of a whole filtered image."""
     row, column = light.maxima
     height, width = light.light.shape
@@ -359,7 +359,7 @@ def search_windows(
     searched = np.zeros((len(middle), size, size), dtype=bool)
     inner = np.s_[:, border:-border, border:-border]
     searched[inner] = valid.reshape(searched.shape)[inner]
-    shadows = _found(replace(look, field=searched.reshape(-1, size)), light)
+    shadows = _find_shadows(replace(look, field=searched.reshape(-1, size)), light)
     number = (shadows.uv[:, 1] + 0.5).astype(int) // size
     place = shadows.uv.copy()
     place[:, 1] -= number * size
@@ -412,7 +412,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         outside_id = int(target_id[known][~inside][0])
         raise DataError(f'marker {outside_id} of the first frame lies outside of the image')
     look, filtered = _learn_look(image, given)
-    shadows = _found(look, filtered)
+    shadows = _find_shadows(look, filtered)
     row, column = assign(given, np.full(len(given), GIVEN_SD_PX**2), shadows.uv, GIVEN_GATE)
     if len(row) < max(1, len(given) // 2):
         raise DataError(

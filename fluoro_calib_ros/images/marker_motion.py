@@ -217,10 +217,10 @@ class Motion:
 
 
 def costs(
-    uv: NDArray[np.float64], variance: NDArray[np.float64], found: NDArray[np.float64]
+    uv: NDArray[np.float64], variance: NDArray[np.float64], positions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return costs (n, m), -2 log-likelihood, of places (m, 2) for predictions uv (n, 2)."""
-    offset = uv[:, None] - found[None]
+    offset = uv[:, None] - positions[None]
     squared = (offset * offset).sum(axis=2)
     return squared / variance[:, None] + 2 * np.log(variance)[:, None]
 
@@ -228,17 +228,17 @@ def costs(
 def assign(
     uv: NDArray[np.float64],
     variance: NDArray[np.float64],
-    found: NDArray[np.float64],
+    positions: NDArray[np.float64],
     gate_sigmas: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Assign places (m, 2) to markers predicted at uv (n, 2); return rows of both.
 
     As many markers as possible are assigned a place within their gate, at the least sum of costs.
     """
-    if not len(uv) or not len(found):
+    if not len(uv) or not len(positions):
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
-    cost = costs(uv, variance, found)
-    offset = uv[:, None] - found[None]
+    cost = costs(uv, variance, positions)
+    offset = uv[:, None] - positions[None]
     inside = (offset * offset).sum(axis=2) < gate_sigmas**2 * variance[:, None]
     row, column = linear_sum_assignment(np.where(inside, cost, FAR))
     accepted = inside[row, column]
@@ -246,17 +246,21 @@ def assign(
 
 
 def common_shift(
-    uv: NDArray[np.float64], row: int, beside: NDArray[np.int64], found: cKDTree, reach_px: float
+    uv: NDArray[np.float64],
+    row: int,
+    neighbours: NDArray[np.int64],
+    shadow_tree: cKDTree,
+    reach_px: float,
 ) -> NDArray[np.float64] | None:
     """Return the shift (2,) of a marker that moves most of its neighbours to shadows, or None.
 
-    uv (n, 2) are predictions, beside (k,) the rows of its neighbours.
+    uv (n, 2) are predictions, neighbours (k,) the rows of its neighbours.
     """
-    nearby = found.query_ball_point(uv[row], reach_px)
+    nearby = shadow_tree.query_ball_point(uv[row], reach_px)
     if not nearby:
         return None
-    shift = found.data[nearby] - uv[row]
-    distance = found.query((uv[beside][None] + shift[:, None]).reshape(-1, 2))[0]
+    shift = shadow_tree.data[nearby] - uv[row]
+    distance = shadow_tree.query((uv[neighbours][None] + shift[:, None]).reshape(-1, 2))[0]
     relative = np.minimum(distance.reshape(len(nearby), -1) / GIVEN_SD_PX, 1.0)
     score = (1 - relative**2).sum(axis=1) - 0.5 * np.linalg.norm(shift, axis=1) / reach_px
     best = int(np.argmax(score))
@@ -269,7 +273,7 @@ def doubtful_pairs(
     uv: NDArray[np.float64],
     variance: NDArray[np.float64],
     measured: NDArray[np.bool_],
-    found: NDArray[np.float64],
+    positions: NDArray[np.float64],
     margin: float,
 ) -> NDArray[np.int64]:
     """Return pairs (k, 2) of markers whose places could as well be exchanged.
@@ -281,12 +285,12 @@ def doubtful_pairs(
     variance : (n,) ndarray
         Variances of a measured minus a predicted coordinate.
     measured : (n,) ndarray of bool
-    found : (n, 2) ndarray
+    positions : (n, 2) ndarray
         Measured centres; any value if there is none.
     margin : float
         Least increase of -2 log-likelihood that excludes an exchange.
     """
-    cost = costs(uv, variance, np.where(measured[:, None], found, FAR))
+    cost = costs(uv, variance, np.where(measured[:, None], positions, FAR))
     own_cost = np.where(measured, np.diagonal(cost), 0.0)
     exchanged_cost = np.where(measured[None], cost, 0.0)
     # Both measured: exchanged. One measured: its place may belong to the other.
@@ -376,16 +380,18 @@ class MarkerStates:
         self.unseen[rows] = 1
         self.placed[rows] = 0
 
-    def update(self, found: MeasuredMarkers, frames: int) -> None:
+    def update(self, measured: MeasuredMarkers, frames: int) -> None:
         """Update the measured markers, `frames` after the previous image."""
-        rows = np.flatnonzero(found.measured)
-        self.motion.update(rows, found.uv[rows], found.sigma[rows], frames)
+        rows = np.flatnonzero(measured.measured)
+        self.motion.update(rows, measured.uv[rows], measured.sigma[rows], frames)
         self.unseen[rows] = 0
         # The depth of a shadow is only known if no other shadow overlaps.
-        separate = rows[~found.overlapped[rows]]
+        separate = rows[~measured.overlapped[rows]]
         first = self.depth_sd[separate] > KNOWN_DEPTH_SD
         memory = np.where(first, 0.0, FORGET)
-        self.depth[separate] = memory * self.depth[separate] + (1 - memory) * found.depth[separate]
+        self.depth[separate] = (
+            memory * self.depth[separate] + (1 - memory) * measured.depth[separate]
+        )
         self.depth_sd[separate] = KNOWN_DEPTH_SD
 
     def exchange(self, one: int, other: int) -> None:

@@ -123,9 +123,9 @@ class MarkerViews:
         return ViewsFrame(frames) if joined is None else joined.decided(frames, frame)
 
 
-def _later(target_id: NDArray[np.int64], given: FirstMarkers | None) -> NDArray[np.int64]:
+def _later(target_id: NDArray[np.int64], first: FirstMarkers | None) -> NDArray[np.int64]:
     """Return the ids (k,) of the markers that are not given."""
-    return target_id if given is None else np.setdiff1d(target_id, given.target_id)
+    return target_id if first is None else np.setdiff1d(target_id, first.target_id)
 
 
 def _names(
@@ -170,7 +170,7 @@ class JoinedViews:
         self._by_body = [BodyDecisions(view) for view in self._views]
         self._by_rays = [RayDecisions(view, self._rays) for view in self._views]
         nowhere = MarkerPlaces.nowhere(len(target_id))
-        self._told = [_Told(nowhere, nowhere) for _ in self._views]
+        self._predictions = [_ViewPredictions(nowhere, nowhere) for _ in self._views]
         self._frame = 0
         # Lost bodies are searched from this exposure on, and then after a pause of so many more.
         self._next_search = 0
@@ -192,9 +192,9 @@ class JoinedViews:
         if self._frame:
             self._suggest(frame, self._search(images, frame))
 
-    def decided(self, found: Mapping[str, MarkerFrame], frame: int) -> ViewsFrame:
+    def decided(self, frames: Mapping[str, MarkerFrame], frame: int) -> ViewsFrame:
         """Return the markers of the views after decisions by the other views."""
-        exposure = self._rays.intersect(self._without_missed(found, frame), self._rig.angles)
+        exposure = self._rays.intersect(self._without_missed(frames, frame), self._rig.angles)
         self._bodies.update(exposure, frame)
         self._missed &= ~self._bodies.present.known  # their bodies have a pose again
         self._doubt_unsupported(exposure, frame)
@@ -203,7 +203,7 @@ class JoinedViews:
         self._bodies.learn(exposure, exposure.sure & ~np.isin(self._target_id, decided))
         self._frame = frame
         revised = {
-            view.name: view.revised(found[view.name], decisions, frame) for view in self._views
+            view.name: view.revised(frames[view.name], decisions, frame) for view in self._views
         }
         return ViewsFrame(revised, decisions)
 
@@ -220,24 +220,24 @@ class JoinedViews:
                 )
 
     def _without_missed(
-        self, found: Mapping[str, MarkerFrame], frame: int
+        self, frames: Mapping[str, MarkerFrame], frame: int
     ) -> dict[str, MarkerFrame]:
         """Doubt the measured markers of bodies that are not at their expected places."""
-        views = [view for view in self._views if _is_of_image(found[view.name])]
+        views = [view for view in self._views if _is_of_image(frames[view.name])]
         rows = [view.view for view in views]
         measured_before = self._measured[rows]
         for view in views:
-            self._measured[view.view] = np.isin(self._target_id, found[view.name].target_id)
+            self._measured[view.view] = np.isin(self._target_id, frames[view.name].target_id)
         missed = self._bodies.miss(self._measured[rows], measured_before)
         if missed.any():
             self._next_search = 0
             self._pause = 1
         self._missed |= missed
-        out = dict(found)
+        out = dict(frames)
         for view in views:
             view.doubt(np.flatnonzero(self._missed & self._measured[view.view]), frame)
-            doubtful = np.isin(found[view.name].target_id, view.tracker.doubtful())
-            out[view.name] = replace(found[view.name], doubtful=doubtful)
+            doubtful = np.isin(frames[view.name].target_id, view.tracker.doubtful())
+            out[view.name] = replace(frames[view.name], doubtful=doubtful)
         return out
 
     def _doubt_unsupported(self, exposure: MarkerExposure, frame: int) -> None:
@@ -266,9 +266,9 @@ class JoinedViews:
         """
         present_places = self._bodies.present
         predicted_places = self._bodies.predicted(frame)
-        for view, reported in zip(self._views, self._told):
-            expected = predicted_places.filled(reported.expected(frame))
-            previous = present_places.filled(reported.places)
+        for view, predicted in zip(self._views, self._predictions):
+            expected = predicted_places.filled(predicted.expected(frame))
+            previous = present_places.filled(predicted.places)
             rows = np.searchsorted(self._target_id, view.tracker.unsure())
             rows = rows[(expected.known & previous.known & ~placed)[rows]]
             if not len(rows):
@@ -329,11 +329,13 @@ class JoinedViews:
         """
         out: list[Decision] = []
         missing = ~self._bodies.present.known
-        self._told = [
-            reported.next(self._rays.by_others(exposure, view, missing), frame)
-            for view, reported in enumerate(self._told)
+        self._predictions = [
+            predicted.next(self._rays.by_others(exposure, view, missing), frame)
+            for view, predicted in enumerate(self._predictions)
         ]
-        expected = [self._bodies.present.filled(reported.places) for reported in self._told]
+        expected = [
+            self._bodies.present.filled(predicted.places) for predicted in self._predictions
+        ]
         for view, (by_body, view_places) in enumerate(zip(self._by_body, expected)):
             place = self._rig.project(view, view_places.xyz_mm)
             sd = self._rig.spread(view, view_places.xyz_mm, view_places.covariance)
@@ -344,7 +346,7 @@ class JoinedViews:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _ViewPredictions:
     """Places of the markers of a view by the other views, in the last two exposures."""
 
     places: MarkerPlaces
@@ -352,9 +354,9 @@ class _Told:
     frame: int = 0
     frame_before: int = 0
 
-    def next(self, places: MarkerPlaces, frame: int) -> _Told:
+    def next(self, places: MarkerPlaces, frame: int) -> _ViewPredictions:
         """Return the places after another exposure."""
-        return _Told(places, self.places, frame, self.frame)
+        return _ViewPredictions(places, self.places, frame, self.frame)
 
     def expected(self, frame: int) -> MarkerPlaces:
         """Return the expected places of the markers in the next exposure."""
@@ -362,6 +364,6 @@ class _Told:
         return self.places.moved_on(self.before, share)
 
 
-def _is_of_image(found: MarkerFrame) -> bool:
+def _is_of_image(markers: MarkerFrame) -> bool:
     """Return whether there was an image in which something could be seen."""
-    return found.finding is None or found.finding.kind is Kind.NO_MARKERS
+    return markers.finding is None or markers.finding.kind is Kind.NO_MARKERS

@@ -69,7 +69,7 @@ class MarkerWatch:
 
     def shadows_met(
         self,
-        found: MeasuredMarkers,
+        markers: MeasuredMarkers,
         states: MarkerStates,
         frame: int,
         is_first: bool = False,
@@ -80,10 +80,10 @@ class MarkerWatch:
         if places are not predicted, but given, to a pixel or two.
         """
         motion = states.motion
-        measured = found.measured.copy()
+        measured = markers.measured.copy()
         out = []
-        variance = motion.innovation_variance(found.sigma)
-        pairs = doubtful_pairs(motion.uv, variance, measured, found.uv, self._margin)
+        variance = motion.innovation_variance(markers.sigma)
+        pairs = doubtful_pairs(motion.uv, variance, measured, markers.uv, self._margin)
         # After the first image, exchanges cannot be recognised before a velocity is known.
         settled = motion.settled | is_first
         distances = np.linalg.norm(motion.uv[pairs[:, 0]] - motion.uv[pairs[:, 1]], axis=1)
@@ -102,14 +102,14 @@ class MarkerWatch:
                 self._doubts.add_pair(i, j, frame)
                 ids = (int(self._target_id[i]), int(self._target_id[j]))
                 out.append(doubt_in(Kind.SHADOWS_MET, frame, *ids))
-        return replace(found, measured=measured), tuple(out)
+        return replace(markers, measured=measured), tuple(out)
 
-    def found_again(
-        self, found: MeasuredMarkers, states: MarkerStates, frame: int
+    def recovered(
+        self, measured: MeasuredMarkers, states: MarkerStates, frame: int
     ) -> tuple[Finding, ...]:
         """Note which newly seen markers may be a false shadow in their gate."""
         out = []
-        for row in np.flatnonzero(found.measured & (states.unseen > 1)).tolist():
+        for row in np.flatnonzero(measured.measured & (states.unseen > 1)).tolist():
             area = np.pi * self._gate**2 * states.motion.variance[row]
             if area * self._density > FALSE_SHADOWS and row not in self._doubts.partners(row):
                 images = int(states.unseen[row]) - 1
@@ -117,17 +117,17 @@ class MarkerWatch:
         return tuple(out)
 
     def other_shadows(
-        self, found: MeasuredMarkers, states: MarkerStates, frame: int
+        self, measured: MeasuredMarkers, states: MarkerStates, frame: int
     ) -> tuple[Finding, ...]:
         """Note which markers could as well be a shadow that is assigned to no marker."""
         motion = states.motion
-        rows = np.flatnonzero(found.measured & motion.settled)
-        if not len(found.free) or not len(rows):
+        rows = np.flatnonzero(measured.measured & motion.settled)
+        if not len(measured.free) or not len(rows):
             return ()
         variance = motion.variance[rows] + SHADOW_SD_PX**2
         # Use the places before the fit: it may move to another shadow that fits better.
-        own_squared = ((motion.uv[rows] - found.shadow[rows]) ** 2).sum(axis=1) / variance
-        offset = motion.uv[rows][:, None] - found.free[None]
+        own_squared = ((motion.uv[rows] - measured.shadow[rows]) ** 2).sum(axis=1) / variance
+        offset = motion.uv[rows][:, None] - measured.free[None]
         free_squared = (offset**2).sum(axis=2) / variance[:, None]
         out = []
         for row in rows[free_squared.min(axis=1) - own_squared < self._margin].tolist():
@@ -136,7 +136,7 @@ class MarkerWatch:
         return tuple(out)
 
     def moving_alone(
-        self, found: MeasuredMarkers, states: MarkerStates, frame: int, frames: int
+        self, measured: MeasuredMarkers, states: MarkerStates, frame: int, frames: int
     ) -> tuple[Finding, ...]:
         """Doubt markers that move unlike their former company, and confirm some that move with it.
 
@@ -145,7 +145,7 @@ class MarkerWatch:
         after the image, `frames` after the previous image.
         """
         alone, together = self._company.compare(
-            states.motion, found.measured, self._doubts.doubtful, frames
+            states.motion, measured.measured, self._doubts.doubtful, frames
         )
         out = []
         for row in alone:
@@ -162,10 +162,10 @@ class MarkerWatch:
 
 # Reasons why an id may be wrong.
 DOUBTS = {
-    Kind.SHADOWS_MET: 'their shadows met and parted',
+    Kind.SHADOWS_MET: 'their shadows overlapped and separated',
     Kind.MARKER_FOUND_AGAIN: 'found again after {images} images',
-    Kind.OTHER_SHADOW: 'another shadow was as near to where it was expected',
-    Kind.MARKER_MOVES_ALONE: 'it moves unlike the markers that it moved with',
+    Kind.OTHER_SHADOW: 'another shadow was as close to its prediction',
+    Kind.MARKER_MOVES_ALONE: 'it no longer moves with its former neighbours',
 }
 
 
@@ -257,7 +257,7 @@ def velocity_beside(states: MarkerStates, row: int) -> tuple[NDArray[np.float64]
     return velocity, float(np.abs(motion.velocity[company] - velocity).max())
 
 
-def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: int) -> None:
+def shift_together(states: MarkerStates, shadows: Shadows, gate: float, frames: int) -> None:
     """Shift markers of unknown velocity, or with too wide a gate to search, with their neighbours.
 
     A single marker could be any shadow in a wide gate; several that keep their relative places
@@ -267,9 +267,9 @@ def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: in
     is_uncertain = (~motion.settled | (gate * np.sqrt(motion.variance) > MAX_HALF)) & (
         states.placed > 0
     )
-    if not is_uncertain.any() or len(found.uv) < 2 or len(motion.uv) < 2:
+    if not is_uncertain.any() or len(shadows.uv) < 2 or len(motion.uv) < 2:
         return
-    tree = cKDTree(found.uv)
+    tree = cKDTree(shadows.uv)
     before = motion.uv.copy()
     for row in np.flatnonzero(is_uncertain).tolist():
         neighbours = np.argsort(np.linalg.norm(before - before[row], axis=1), kind='stable')

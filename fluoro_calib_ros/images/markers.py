@@ -47,7 +47,7 @@ class MarkerOptions:
 
     gate: float = option(
         4.5,
-        'distance from its prediction within which a marker is looked for',
+        'largest distance from its prediction at which a marker is searched for',
         minimum=1,
         maximum=20,
         unit='standard deviations',
@@ -60,7 +60,7 @@ class MarkerOptions:
     )
     search_every: int = option(
         30,
-        'images in which the whole image is searched, in strips, where a marker is lost',
+        'images over which the search of the whole image for a lost marker is spread, in strips',
         minimum=1,
         maximum=100000,
         unit='images',
@@ -100,10 +100,10 @@ class FirstMarkers:
         if not len(ids):
             raise DataError('the first frame has no markers')
         if uv.shape != (len(ids), 2):
-            raise DataError(f'{len(ids)} markers, but places of shape {uv.shape}')
+            raise DataError(f'{len(ids)} markers, but image points of shape {uv.shape}')
         if not np.isfinite(uv).all():
             unplaced_id = ids[~np.isfinite(uv).all(axis=1)][0]
-            raise DataError(f'marker {unplaced_id} of the first frame has no place')
+            raise DataError(f'marker {unplaced_id} of the first frame has no image point')
         unique, count = np.unique(ids, return_counts=True)
         if (count > 1).any():
             raise DataError(f'marker {unique[count > 1][0]} occurs twice in the first frame')
@@ -319,13 +319,13 @@ class MarkerTracker:
         """Return all shadows in an image that look like markers."""
         return self._known().search.everywhere(image)
 
-    def place(self, given: FirstMarkers) -> None:
+    def place(self, positions: FirstMarkers) -> None:
         """Set places of markers in the next image, given by a person or by their bodies.
 
         Ids of markers that are measured there are certain. A marker that is tracked to its place
         anyway keeps its state. If a place is given twice, the first one counts.
         """
-        self._given.append(given)
+        self._given.append(positions)
 
     def suggest(
         self,
@@ -404,10 +404,10 @@ class MarkerTracker:
         return np.unique(np.concatenate(given))
 
     def _believe(
-        self, given: NDArray[np.int64], found: MeasuredMarkers, doubts: tuple[Finding, ...]
+        self, rows: NDArray[np.int64], measured: MeasuredMarkers, doubts: tuple[Finding, ...]
     ) -> tuple[Finding, ...]:
         """Revoke the doubts in markers whose places were given; return the remaining doubts."""
-        confirmed_rows = given[found.measured[given]]
+        confirmed_rows = rows[measured.measured[rows]]
         for row in confirmed_rows.tolist():
             self._known().doubts.confirm(row)
         ids = set(self.target_id[confirmed_rows].tolist())
@@ -428,7 +428,7 @@ class MarkerTracker:
         markers = followed.measurement.measure(windows, shadows, states)
         unknown = ~states.motion.settled | (states.unseen > 1)
         markers, doubts = watch.shadows_met(markers, states, frame, is_first=self._images == 0)
-        doubts += watch.found_again(markers, states, frame)
+        doubts += watch.recovered(markers, states, frame)
         doubts += watch.other_shadows(markers, states, frame)
         # In the first image, and at given places, ids are certain.
         self._anew = markers.measured & unknown & (states.placed > 0) & (self._images > 0)
@@ -441,14 +441,14 @@ class MarkerTracker:
 
     def _result(
         self,
-        found: MeasuredMarkers,
+        markers: MeasuredMarkers,
         doubts: tuple[Finding, ...],
         finding: Finding | None,
         begin: float,
     ) -> MarkerFrame:
         """Return the markers of the current image."""
         followed = self._followed
-        measured = found.measured
+        measured = markers.measured
         missing = ~measured
         doubtful = np.zeros(len(measured), dtype=bool)
         predicted = np.full((len(measured), 2), np.nan)
@@ -461,9 +461,9 @@ class MarkerTracker:
         return MarkerFrame(
             self._frame,
             self.target_id[measured],
-            uv=found.uv[measured],
-            sigma=found.sigma[measured],
-            overlapped=found.overlapped[measured],
+            uv=markers.uv[measured],
+            sigma=markers.sigma[measured],
+            overlapped=markers.overlapped[measured],
             doubtful=doubtful[measured],
             missing=self.target_id[missing],
             predicted=predicted[missing],

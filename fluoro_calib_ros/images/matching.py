@@ -118,7 +118,7 @@ class PhantomModel:
         """
         grid = FlatGrid.of(xyz)
         if regular and grid is None:
-            raise DataError('the phantom is no flat grid with rows and columns')
+            raise DataError('the phantom is not a flat grid with rows and columns')
         return cls(
             xyz,
             diameter_mm,

@@ -708,11 +708,11 @@ class _Sizes:
         differs &= common > DISTURBED * own
         return bool(np.mean(differs[own < DISTURBED * np.median(own)]) <= OTHERS)
 
-    def with_sizes(self, rows: NDArray[np.int64], found: NDArray[np.float64]) -> _Sizes:
+    def with_sizes(self, rows: NDArray[np.int64], sizes: NDArray[np.float64]) -> _Sizes:
         """Return a comparison whose profile is estimated from beads with sizes (m,) found."""
-        middle = float(np.median(found))
+        middle = float(np.median(sizes))
         size = np.full_like(self.imaging.size, np.nan)
-        size[self.shadows.row[rows]] = found / middle
+        size[self.shadows.row[rows]] = sizes / middle
         radius_px = self.imaging.profile.radius_px * middle
         profile = _typical(self.light, self.shadows, size, radius_px)
         return _Sizes(self.light, self.shadows, Imaging(self.imaging.noise, profile, size))

@@ -125,7 +125,7 @@ RADIUS_PX = 7
 
 
 def draw_markers(
-    image: np.ndarray, found: MarkerFrame, target_names: Mapping[int, str] | None = None
+    image: np.ndarray, markers: MarkerFrame, target_names: Mapping[int, str] | None = None
 ) -> NDArray[np.uint8]:
     """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w).
 
@@ -138,10 +138,12 @@ def draw_markers(
     marks = [
         (target, uv, UNEXPLAINED if doubtful else OVERLAPPED if overlapped else MATCHED, True)
         for target, uv, overlapped, doubtful in zip(
-            found.target_id, found.uv, found.overlapped, found.doubtful
+            markers.target_id, markers.uv, markers.overlapped, markers.doubtful
         )
     ]
-    marks += [(target, uv, REFUSED, False) for target, uv in zip(found.missing, found.predicted)]
+    marks += [
+        (target, uv, REFUSED, False) for target, uv in zip(markers.missing, markers.predicted)
+    ]
     for target, uv, colour, seen in marks:
         if not np.isfinite(uv).all() or np.abs(uv).max() > 2**14:
             continue
@@ -155,12 +157,12 @@ def draw_markers(
         font = cv2.FONT_HERSHEY_SIMPLEX
         cv2.putText(picture, text, place, font, 0.35, colour, 1, cv2.LINE_AA)
     lines = [
-        (f'{len(found.target_id)} markers, {int(found.overlapped.sum())} overlapped', MATCHED),
-        (f'{int(found.doubtful.sum())} with a doubtful id', UNEXPLAINED),
-        (f'{len(found.missing)} not seen', REFUSED),
+        (f'{len(markers.target_id)} markers, {int(markers.overlapped.sum())} overlapped', MATCHED),
+        (f'{int(markers.doubtful.sum())} with a doubtful id', UNEXPLAINED),
+        (f'{len(markers.missing)} not seen', REFUSED),
     ]
-    if found.reason:
-        lines.append((found.reason, REFUSED))
+    if markers.reason:
+        lines.append((markers.reason, REFUSED))
     return _labelled(picture, lines)
 
 

@@ -156,7 +156,7 @@ def local_poses(
     uv: NDArray[np.float64],
     neighbours: int,
     triples: Triples,
-    found: NDArray[np.uint8],
+    detected: NDArray[np.uint8],
     scales: tuple[float, float],
 ) -> list[LocalPose]:
     """Return the poses with the most votes for a bead of the image, best first.
@@ -170,7 +170,7 @@ def local_poses(
     neighbours : int
         Number of its neighbours that form triples with it.
     triples : Triples
-    found : (h, w) ndarray of uint8
+    detected : (h, w) ndarray of uint8
         1 near a bead of the image, 2 outside the field, else 0.
     scales : tuple of float
         Smallest and largest scale [px/mm].
@@ -187,7 +187,7 @@ def local_poses(
         parts = [
             _solutions(p, q, triples, scales) for p, q in sides[start : start + PAIRS_AT_ONCE]
         ]
-        poses += _best(parts, triples, centre, found)
+        poses += _best(parts, triples, centre, detected)
         if any(pose.vote >= SURE_VOTE for pose in poses):
             break
     return sorted(poses, key=lambda pose: -pose.vote)[:KEPT]
@@ -197,12 +197,12 @@ def _best(
     parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]],
     triples: Triples,
     centre: NDArray[np.float32],
-    found: NDArray[np.uint8],
+    detected: NDArray[np.uint8],
 ) -> list[LocalPose]:
     """Return the poses with the most votes among the solutions of several image triples."""
     triple, axes, scale = (np.concatenate(values) for values in zip(*parts))
     # A border of pixels around the image represents all places outside it.
-    field = np.pad(found, 1, constant_values=2)
+    field = np.pad(detected, 1, constant_values=2)
     selected, votes = _elected(centre, axes, triple, triples.voter, field)
     if len(selected) > MAX_POSES:
         selected = selected[np.argsort(-votes, kind='stable')[:MAX_POSES]]
@@ -354,7 +354,7 @@ MISSED = 1e-3  # accepted probability that a right pose is missed
 
 
 def enough_seeds(
-    xyz: NDArray[np.float64], found: int, radius: float, neighbours: tuple[int, int]
+    xyz: NDArray[np.float64], detected: int, radius: float, neighbours: tuple[int, int]
 ) -> int:
     """Return the number of beads after which a search may end; 0 if no view shows isolated beads.
 
@@ -362,18 +362,18 @@ def enough_seeds(
     ----------
     xyz : (n, 3) ndarray
         Beads of the phantom [mm].
-    found : int
+    detected : int
         Number of detections in the image.
     radius : float
         Radius of a bead, including its blur, at the scale of the phantom [mm].
     neighbours : tuple of int
         Neighbours of a bead in the phantom and in the image that form triples with it.
     """
-    share = float(np.clip(MIN_FOUND * len(xyz) / found, MIN_EXPLAINED, 1.0))
+    share = float(np.clip(MIN_FOUND * len(xyz) / detected, MIN_EXPLAINED, 1.0))
     chance = LEADS * _chances(xyz, share, MERGED * radius, neighbours)
     missed = np.ones(len(chance))
     seeds = 0
-    while seeds < found and np.sum(missed) > MISSED * len(chance):
+    while seeds < detected and np.sum(missed) > MISSED * len(chance):
         missed = missed * (1 - chance)
         seeds += 1
     return seeds

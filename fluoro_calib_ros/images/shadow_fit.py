@@ -771,9 +771,9 @@ class _Blurred:
         blurred = np.array([np.convolve(row, one, mode='same') for one in kernels])
         return np.asarray(blurred[:, len(row) // 2 :].T.reshape(-1)[: self._size])
 
-    def _derivative(self, away: np.ndarray, order: int) -> NDArray[np.float64]:
+    def _derivative(self, offset: np.ndarray, order: int) -> NDArray[np.float64]:
         """Return the derivative of a Gaussian divided by the Gaussian itself."""
-        reduced = away / self.sigma
+        reduced = offset / self.sigma
         if order == 0:
             return np.ones_like(reduced)
         return -reduced / self.sigma if order == 1 else (reduced**2 - 1) / self.sigma**2

@@ -310,6 +310,6 @@ def shared_lens(lens: Lens, views: Sequence[View]) -> Lens | None:
     )
 
 
-def may_be_found(found: Finding | None) -> bool:
+def lacks_certain_pose(finding: Finding | None) -> bool:
     """Return whether an image was refused because no certain pose was found for its beads."""
-    return found is not None and found.kind in NOT_FOUND
+    return finding is not None and finding.kind in NOT_FOUND

@@ -47,12 +47,12 @@ def os_error_reason(error: OSError) -> str:
 
 
 @contextmanager
-def os_errors(path: object, what: str) -> Iterator[None]:
-    """Turn an OSError into a DataError; what: the failure, such as 'cannot be read'."""
+def os_errors(path: object, failure: str) -> Iterator[None]:
+    """Turn an OSError into a DataError; failure: the failure, such as 'cannot be read'."""
     try:
         yield
     except OSError as error:
-        raise DataError(f'{path}: {what} ({os_error_reason(error)})') from None
+        raise DataError(f'{path}: {failure} ({os_error_reason(error)})') from None
 
 
 def check_regular_file(path: PathLike) -> None:
@@ -93,8 +93,7 @@ def read_bytes(path: PathLike) -> bytes:
         limits = read_limits()
         if size > limits.max_file_bytes:
             raise DataError(
-                f'the file has {size / 1e6:.0f} MB, more than {limits.max_file_mb} MB '
-                'are not read',
+                f'the file has {size / 1e6:.0f} MB; the limit is {limits.max_file_mb} MB',
                 at=path,
             )
         content = file.read()
@@ -138,7 +137,7 @@ def check_rows(text: str, most: int, where: object) -> None:
     """Raise DataError for a text of more than `most` rows; the message begins with where."""
     rows = text.count('\n')
     if rows > most:
-        raise DataError(f'{where}: {rows} rows, more than {most} are not read')
+        raise DataError(f'{where}: {rows} rows; the limit is {most}')
 
 
 def check_safe_name(name: str, where: object) -> None:

@@ -132,8 +132,7 @@ def _read_members(
     limits = read_limits()
     if size > limits.max_file_bytes:
         raise DataError(
-            f'{path}: its arrays take {size / 1e6:.0f} MB, more than {limits.max_file_mb} MB are '
-            'not read'
+            f'{path}: its arrays take {size / 1e6:.0f} MB; the limit is {limits.max_file_mb} MB'
         )
     version = _read_version(path, archive, layout)
     for field in layout.fields:
@@ -157,13 +156,13 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
     version = _read_member(path, archive, 'format_version')
     if version.shape != () or version.dtype.kind not in 'iu':
         raise DataError(
-            f'{path}: this is not {layout.content} file, its format_version is not a whole number'
+            f'{path}: this is not {layout.content} file, its format_version is not an integer'
         )
     if not 1 <= version <= layout.version:
         last = layout.version
         known_versions = 'version 1' if last == 1 else f'versions 1 to {last}'
         raise DataError(
-            f'{path}: the file has layout version {int(version)}, this program knows '
+            f'{path}: the file has layout version {int(version)}, this program reads '
             f'{known_versions}'
         )
     return int(version)
@@ -203,8 +202,7 @@ def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndar
 
 def _no_plain_array(path: PathLike, name: str) -> DataError:
     return DataError(
-        f'{path}: the array {name} does not contain plain numbers or text, and nothing else is '
-        'read'
+        f'{path}: the array {name} does not contain plain numbers or text, only these are read'
     )
 
 

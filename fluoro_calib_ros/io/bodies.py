@@ -70,7 +70,8 @@ def read_bodies(path: PathLike) -> tuple[Body, ...]:
         unknown = [name for name in block.header if name not in BODY_COLUMNS]
         if unknown:
             raise DataError(
-                f'{path}: the column {unknown[0]!r} is unknown, there are {",".join(BODY_COLUMNS)}'
+                f'{path}: the column {unknown[0]!r} is unknown, expected one of '
+                f'{",".join(BODY_COLUMNS)}'
             )
         names = block.strings('body')
         markers = block.ids('marker').tolist()
@@ -180,7 +181,7 @@ def read_joints(path: PathLike, bodies: Iterable[Body | str]) -> tuple[JointEntr
     if not isinstance(tables, list) or not tables:
         raise DataError(f'{path}: the file has no table [[joint]]')
     if len(tables) > MAX_JOINTS:
-        raise DataError(f'{path}: {len(tables)} joints, more than {MAX_JOINTS} are not read')
+        raise DataError(f'{path}: {len(tables)} joints; the limit is {MAX_JOINTS}')
     entries = tuple(_entry(path, n, table) for n, table in enumerate(tables, 1))
     with ErrorsAt(path):
         names = [body if isinstance(body, str) else body.name for body in bodies]
@@ -197,12 +198,12 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
         where = f'{path}, joint {table["name"]}'
     for key in table:
         if key not in KEYS:
-            raise DataError(f'{where}, key {key}: unknown, there are {", ".join(KEYS)}')
+            raise DataError(f'{where}, key {key}: unknown, expected one of {", ".join(KEYS)}')
     texts: dict[str, str] = {}
     for key in (*REQUIRED, 'side'):
         value = table.get(key, '' if key == 'side' else None)
         if not isinstance(value, str) or (not value and key != 'side'):
-            raise DataError(f'{where}, key {key}: a text is expected')
+            raise DataError(f'{where}, key {key}: expected a text')
         texts[key] = value
     try:
         joint_convention = convention(texts['convention'])
@@ -230,7 +231,9 @@ def _neutral(where: str, value: Any) -> tuple[int, int] | None:
         return None
     are_integers = isinstance(value, list) and all(type(v) is int for v in value)
     if not are_integers or len(value) != 2 or not 0 <= value[0] <= value[1]:
-        raise DataError(f'{where}, key neutral: first and last exposure, such as [1, 100]')
+        raise DataError(
+            f'{where}, key neutral: expected first and last exposure, such as [1, 100]'
+        )
     return value[0], value[1]
 
 
@@ -243,7 +246,9 @@ def _frame(of: Convention, end: str, table: Any, side: str) -> AnatomicalFrame:
             raise DataError('this is not a table')
         for key in table:
             if key not in FRAME_KEYS:
-                raise DataError(f'the key {key} is unknown, there are {", ".join(FRAME_KEYS)}')
+                raise DataError(
+                    f'the key {key} is unknown, expected one of {", ".join(FRAME_KEYS)}'
+                )
         given_keys = [key for key in FRAME_KEYS[:4] if key in table]
         if len(given_keys) != 1:
             raise DataError(f'one of {", ".join(FRAME_KEYS[:4])} is needed, not {len(given_keys)}')

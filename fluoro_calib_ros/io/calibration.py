@@ -139,14 +139,14 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
     limits = read_limits()
     if lengths['train_uv'] > limits.max_training_points:
         raise DataError(
-            f'{where}: {lengths["train_uv"]} training points, more than '
-            f'{limits.max_training_points} are not read'
+            f'{where}: {lengths["train_uv"]} training points; the limit is '
+            f'{limits.max_training_points}'
         )
     # Points that coincide in single precision: a search tree cannot separate them.
     counts = np.unique(arrays['train_uv'].astype(np.float32), axis=0, return_counts=True)[1]
     if counts.max(initial=0) > MAX_COINCIDENT:
         raise DataError(
-            f'{where}: more than {MAX_COINCIDENT} training points lie on one place of the image'
+            f'{where}: more than {MAX_COINCIDENT} training points coincide in the image'
         )
     c = arrays['interior'][2]
     if c <= 0:
@@ -221,8 +221,8 @@ def load_orientation(path: PathLike) -> RigOrientation:
     max_fluoroscopes = read_limits().max_fluoroscopes
     if len(values['fluoroscope']) > max_fluoroscopes:
         raise DataError(
-            f'{path}: the orientation has {len(values["fluoroscope"])} fluoroscopes, more than '
-            f'{max_fluoroscopes} are not read'
+            f'{path}: the orientation has {len(values["fluoroscope"])} fluoroscopes; the limit '
+            f'is {max_fluoroscopes}'
         )
     for name in values['fluoroscope'].tolist():
         check_safe_name(name, path)
@@ -338,7 +338,7 @@ def changed_since_verdict(directory: PathLike, verdict: Mapping[str, Any]) -> Fi
         changed = [n for n in files if _digest_of_file(Path(directory) / n) != files[n]]
     except DataError as error:
         return error.finding
-    return _edited(directory, changed[0], 'the verdict is not about it') if changed else None
+    return _edited(directory, changed[0], 'the verdict does not apply to it') if changed else None
 
 
 @dataclass(frozen=True)
@@ -400,9 +400,9 @@ def exchanged(
     return Finding(
         Kind.EXCHANGED_CALIBRATION,
         f'the calibration file{"s" * (len(mismatched) > 1)} of {", ".join(mismatched)} and '
-        f'{RESULT_NAME} are of different calibrations',
+        f'{RESULT_NAME} belong to different calibrations',
         Place(tuple(mismatched), name=str(directory)),
-        'one of them was exchanged; restore the files of one calibration, or calibrate again',
+        'one of them was replaced; restore the files of one calibration, or calibrate again',
         Severity.WARNING,
     )
 
@@ -416,7 +416,7 @@ def edited(
     content = {key: value for key, value in document.items() if key != DIGEST}
     if document[DIGEST] == _digest(content):
         return None
-    return _edited(directory, name, 'its figures need not be those of the calibration')
+    return _edited(directory, name, 'its figures may not match the calibration')
 
 
 def _edited(directory: PathLike, name: str, consequence: str) -> Finding:

@@ -152,8 +152,8 @@ def read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
     document = read_json(_require_file(path))
     if document.get('format_version') != VERSION:
         raise DataError(
-            f'{path}: the file has layout version {document.get("format_version")}, '
-            f'this program knows version {VERSION}'
+            f'{path}: the file has layout version {document.get("format_version")}, this program '
+            f'reads version {VERSION}'
         )
     try:
         options = CalibrationOptions(**document['options'])
@@ -202,10 +202,12 @@ def read_radiographs(
         if not path.is_file():
             continue
         if path.stat().st_size > MEGABYTE:  # 512 x 512 px without compression: a quarter of it
-            raise DataError(f'{path}: this is no small radiograph, it has over {MEGABYTE} bytes')
+            raise DataError(
+                f'{path}: this is not a small radiograph, it has over {MEGABYTE} bytes'
+            )
         content = read_bytes(path)
         if not content.startswith(JPEG_START):
-            raise DataError(f'{path}: this is no JPEG image')
+            raise DataError(f'{path}: this is not a JPEG image')
         radiographs.setdefault(name, {})[exposure] = content
     return radiographs
 

@@ -63,7 +63,7 @@ class Block:
 
     def ids(self, name: str) -> NDArray[np.int64]:
         """Return a column (n,) of whole numbers from 0 to MAX_ID. Raises DataError."""
-        values = self._convert(name, self.strings(name), int, 'a whole number')
+        values = self._convert(name, self.strings(name), int, 'an integer')
         if len(values) and not 0 <= min(values) <= max(values) <= MAX_ID:
             in_range = np.array([0 <= value <= MAX_ID for value in values])
             self.require(name, in_range, f'not between 0 and {MAX_ID}')
@@ -364,7 +364,7 @@ def read_names(directory: PathLike) -> Names:
                 with suppress(ValueError):
                     value = int(identity)
                 if not 0 <= value <= MAX_ID:
-                    block.fail(index, f'id is {identity!r}, not a whole number')
+                    block.fail(index, f'id is {identity!r}, not an integer')
             if name in table or value in table.values():
                 block.fail(index, f'the {kind} {name!r}, id {identity}, is given twice')
             table[name] = value

@@ -94,8 +94,8 @@ def _new_id(block: Block, index: int, row: Mapping[str, str], names: Names) -> i
     if not row['target_id']:
         block.fail(
             index,
-            f'decision is {text!r}, but a whole exposure can only be left out: {LEAVE_OUT!r}; for '
-            'another id, name the target_id',
+            f'decision is {text!r}, but a whole exposure can only be excluded ({LEAVE_OUT!r}); '
+            'to change an id, name the target_id',
         )
     if text not in names.targets and not text.isdecimal():
         block.fail(index, f'decision is {text!r}, neither {LEAVE_OUT!r} nor a target_id')
@@ -110,5 +110,5 @@ def _number(
     if text in known:
         return known[text]
     if not text.isdecimal() or int(text[:11]) > MAX_ID:
-        block.fail(index, f'{column} is {text!r}, not a whole number from 0 to {MAX_ID}')
+        block.fail(index, f'{column} is {text!r}, not an integer from 0 to {MAX_ID}')
     return int(text)

@@ -78,9 +78,9 @@ class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[mi
         if any(key.tag == 'tag:yaml.org,2002:merge' for key, _ in node.value):
             self._refuse('merged keys', node)
 
-    def _refuse(self, what: str, node: Any) -> NoReturn:
+    def _refuse(self, construct: str, node: Any) -> NoReturn:
         raise yaml.constructor.ConstructorError(
-            None, None, f'{what} are not allowed', node.start_mark
+            None, None, f'{construct} are not allowed', node.start_mark
         )
 
 
@@ -133,8 +133,8 @@ def _check_size(kind: str, text: str, where: object) -> None:
     limit = DOCUMENT_BYTES[kind]
     if len(text) > limit:
         raise DataError(
-            f'{where}: the {kind} text has {len(text) / 1e6:.1f} MB, more than {limit / 1e6:g} MB '
-            'are not read'
+            f'{where}: the {kind} text has {len(text) / 1e6:.1f} MB; the limit is '
+            f'{limit / 1e6:g} MB'
         )
 
 
@@ -190,7 +190,7 @@ def _check_whole(value: Any) -> None:
 def _whole(value: str | int) -> int:
     # 64-bit integers have up to 19 digits; converting many more takes quadratic time.
     if (isinstance(value, str) and len(value) > 19) or abs(int(value)) > 2**63:
-        raise ValueError('a whole number is too large')
+        raise ValueError('an integer is too large')
     return int(value)
 
 

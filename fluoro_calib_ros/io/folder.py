@@ -81,7 +81,8 @@ def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathL
             )
         if target.startswith(os.path.join(source, '')):
             raise DataError(
-                f'{path}: the output lies in the input {input_path}, choose another output folder'
+                f'{path}: the output is inside the input {input_path}, choose another output '
+                'folder'
             )
     for folder in (target, target + PREVIOUS):
         _check_kind(folder, kind)
@@ -179,7 +180,7 @@ def clean_up(path: PathLike) -> None:
     """
     target = os.path.realpath(path)
     parent = os.path.dirname(target)
-    with os_errors(path, 'what an earlier run left behind cannot be cleaned up'):
+    with os_errors(path, 'files left by an earlier run cannot be removed'):
         for folder in (parent, target):
             for leftover in _leftovers(folder, os.path.basename(target)):
                 if not _is_locked(leftover):

@@ -48,7 +48,7 @@ def read_image_angles(path: PathLike) -> dict[int, float]:
         block.require('angle_deg', valid, 'not an angle')
         for index, (number, angle) in enumerate(zip(numbers.tolist(), np.radians(degrees))):
             if number in rows:
-                block.fail(index, f'image {number} is in row {rows[number]}, too')
+                block.fail(index, f'image {number} is already in row {rows[number]}')
             rows[number] = int(block.lines[index])
             if not np.isnan(angle):
                 angles[number] = float(angle)
@@ -152,7 +152,7 @@ def count_pages(path: PathLike) -> int:
         count = 0
         complete = False
     if not count or not complete:
-        raise DataError('this is no TIFF file, or it is cut off or damaged', at=path)
+        raise DataError('this is not a TIFF file, or it is cut off or damaged', at=path)
     with ErrorsAt(path):
         check_size(*size)
     return count
@@ -206,7 +206,7 @@ def open_images(path: Path) -> ImageSource:
         return _open_dicom(path)
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(
-            f'the ending {suffix_of(path) or "(none)"} is none of an image or a video '
+            f'the suffix {suffix_of(path) or "(none)"} is not that of an image or a video '
             f'({listed(READ_SUFFIXES)})',
             at=path,
         )
@@ -270,7 +270,7 @@ def _open_video(path: Path) -> ImageSource:
     check_name(path)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
-        raise DataError('this is no video that can be read, or it is damaged', at=path)
+        raise DataError('this is not a video that can be read, or it is damaged', at=path)
     with ErrorsAt(path):
         check_size(*(int(video.get(key)) for key in VIDEO_SIZE))
     frame_rate = video.get(cv2.CAP_PROP_FPS)

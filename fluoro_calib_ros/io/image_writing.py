@@ -61,12 +61,12 @@ def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
         if source.kind == 'video':
             suffixes = (*STACK_SUFFIXES, *VIDEO_CODECS)
         raise DataError(
-            f'{out}: a {source.kind} cannot be written as {suffix or "a file without ending"}, '
+            f'{out}: a {source.kind} cannot be written as {suffix or "a file without suffix"}, '
             f'use {listed(suffixes)}'
         )
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(
-            f'{out}: the ending {suffix or "(none)"} is none of an image '
+            f'{out}: the suffix {suffix or "(none)"} is not that of an image '
             f'({listed(IMAGE_SUFFIXES)})'
         )
     _, image = next(source.images)

@@ -155,7 +155,7 @@ def _on_image(
     row = int(np.argmax(is_off))
     u, v = rows.uv[row]
     sentence = (
-        f'{path}, row {rows.line[row]}: the point ({u:g}, {v:g}) is off the image of '
+        f'{path}, row {rows.line[row]}: the point ({u:g}, {v:g}) is outside the image of '
         f'{image_size[0]} x {image_size[1]} px'
     )
     if not leave_out or not few(int(is_off.sum()), len(is_off)):
@@ -483,8 +483,8 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     )
     if CORRECTED_BY in header:
         raise DataError(
-            f'{path}: the image points are corrected already, as its column {CORRECTED_BY} says: '
-            'give the observed ones'
+            f'{path}: the image points are already corrected, according to its column '
+            f'{CORRECTED_BY}: give the observed image points'
         )
     for name in points.added_columns:
         if name in header:

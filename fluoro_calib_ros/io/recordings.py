@@ -79,7 +79,7 @@ def read_dicom_header(path: Path) -> DicomHeader:
     except OSError as error:
         raise DataError(f'cannot be read ({error.strerror or error})', at=path) from None
     except Exception:  # pydicom raises various exceptions for damaged files
-        raise DataError('this is no DICOM file, or it is damaged', at=path) from None
+        raise DataError('this is not a DICOM file, or it is damaged', at=path) from None
     return header
 
 
@@ -242,7 +242,7 @@ def _cine_header(file: BinaryIO, size: int) -> CineHeader:
     fields = _unpack(file, 0, FILE_HEADER)
     signature, _, compression, _, _, _, _, count, at_bitmap, at_setup, at_offsets, _ = fields
     if signature != SIGNATURE:
-        raise DataError('this is no cine file: it does not begin with CI')
+        raise DataError('this is not a cine file: it does not begin with CI')
     if compression:
         kind = {1: 'JPEG images', 2: 'the mosaic of a colour sensor'}.get(
             compression, 'an unknown kind of images'

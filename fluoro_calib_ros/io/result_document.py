@@ -76,16 +76,16 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def finding_document(found: Finding) -> dict[str, Any]:
+def finding_document(finding: Finding) -> dict[str, Any]:
     """Return a finding as a dict, for programs that act on it."""
     return {
-        'kind': found.kind.value,
-        'severity': found.severity.name.lower(),
-        'fluoroscopes': list(found.place.fluoroscopes),
-        'exposures': list(found.place.exposures),
-        'target_id': list(found.place.target_id),
-        'numbers': dict(found.numbers),
-        'sentence': found.sentence,
+        'kind': finding.kind.value,
+        'severity': finding.severity.name.lower(),
+        'fluoroscopes': list(finding.place.fluoroscopes),
+        'exposures': list(finding.place.exposures),
+        'target_id': list(finding.place.target_id),
+        'numbers': dict(finding.numbers),
+        'sentence': finding.sentence,
     }
 
 

@@ -82,7 +82,9 @@ def _names(path: Path, value: Any) -> list[str] | None:
         return None
     valid = isinstance(value, list) and value and all(isinstance(v, str) and v for v in value)
     if not valid or len(set(value)) < len(value):
-        raise DataError(f'{path}, key fluoroscopes: a list of different names, such as ["a", "b"]')
+        raise DataError(
+            f'{path}, key fluoroscopes: expected a list of different names, such as ["a", "b"]'
+        )
     return list(value)
 
 
@@ -91,13 +93,15 @@ def _size(path: Path, value: Any) -> tuple[int, int] | None:
         return None
     are_integers = isinstance(value, list) and all(type(v) is int and v > 0 for v in value)
     if not are_integers or len(value) != 2:
-        raise DataError(f'{path}, key image_size: width and height [px], such as [1024, 1024]')
+        raise DataError(
+            f'{path}, key image_size: expected width and height [px], such as [1024, 1024]'
+        )
     return value[0], value[1]
 
 
 def _units(path: Path, value: Any) -> str | None:
     if value is not None and value not in ('mm', 'cm', 'm'):
-        raise DataError(f'{path}, key units: "mm", "cm" or "m"')
+        raise DataError(f'{path}, key units: expected "mm", "cm" or "m"')
     return value
 
 
@@ -105,7 +109,9 @@ def _phantom_sd(path: Path, value: Any) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 100:
-        raise DataError(f'{path}, key phantom_sd: a standard deviation [mm], such as 0.05')
+        raise DataError(
+            f'{path}, key phantom_sd: expected a standard deviation [mm], such as 0.05'
+        )
     return float(value)
 
 
@@ -116,7 +122,9 @@ def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:
     if value is None:
         return None
     where = f'{path}, key angle_joint'
-    example = 'a joint, such as "carm", or one for each fluoroscope, such as {a = "frontal"}'
+    example = (
+        'expected a joint, such as "carm", or one for each fluoroscope, such as {a = "frontal"}'
+    )
     if isinstance(value, dict):
         words = [*value, *value.values()]
         if not words or not all(
@@ -147,7 +155,7 @@ def _max_age(path: Path, value: Any) -> float | None:
             raise ValueError
         return AngleOptions(angle_max_age=float(value)).angle_max_age
     except (ValueError, OverflowError):
-        raise DataError(f'{path}, key angle_max_age: a time [s], such as 0.5') from None
+        raise DataError(f'{path}, key angle_max_age: expected a time [s], such as 0.5') from None
 
 
 def _about(path: Path, value: Any) -> dict[str, str] | None:
@@ -155,12 +163,12 @@ def _about(path: Path, value: Any) -> dict[str, str] | None:
     if value is None:
         return None
     if not isinstance(value, dict):
-        raise DataError(f'{path}, key about: a table of texts and numbers')
+        raise DataError(f'{path}, key about: expected a table of texts and numbers')
     for key, text in value.items():
         if not isinstance(text, str | int | float) or len(f'{key}{text}') > MAX_ABOUT_TEXT:
             raise DataError(
-                f'{path}, key about.{key}: a text or a number, of at most {MAX_ABOUT_TEXT} '
-                'characters with its name'
+                f'{path}, key about.{key}: expected a text or a number, of at most '
+                f'{MAX_ABOUT_TEXT} characters with its name'
             )
     return {key: str(text) for key, text in value.items()}
 
@@ -171,7 +179,7 @@ def _path(path: Path, key: str, value: Any) -> Path | None:
 
 def _checked_path(path: Path, key: str, value: Any, example: str) -> Path:
     if not isinstance(value, str) or not value or '\0' in value:
-        raise DataError(f'{path}, key {key}: a path is a text, such as "{example}"')
+        raise DataError(f'{path}, key {key}: expected a path, such as "{example}"')
     return Path(value)
 
 
@@ -179,7 +187,7 @@ def _check_keys(path: Path, document: Mapping[str, Any], keys: Sequence[str]) ->
     """Raise DataError for an unknown key."""
     for key in document:
         if key not in keys:
-            raise DataError(f'{path}, key {key}: unknown, there are {", ".join(keys)}')
+            raise DataError(f'{path}, key {key}: unknown, expected one of {", ".join(keys)}')
 
 
 # study.toml: a calibration and the trials that use it, for `fluoro-calib process`.
@@ -273,7 +281,7 @@ def read_study(path: Path) -> StudyFile:
 
 def _table(path: Path, key: str, value: Any) -> Options:
     if not isinstance(value, dict):
-        raise DataError(f'{path}, key {key}: a table of options, such as [{key}]')
+        raise DataError(f'{path}, key {key}: expected a table of options, such as [{key}]')
     return value
 
 
@@ -281,7 +289,7 @@ def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
     """Return the recordings that match any pattern, in order. Raises DataError."""
     valid = isinstance(patterns, list) and all(isinstance(p, str) and p for p in patterns)
     if not valid or not patterns:
-        raise DataError(f'{path}, key trials: paths or patterns, such as ["trials/*"]')
+        raise DataError(f'{path}, key trials: expected paths or patterns, such as ["trials/*"]')
     trials: dict[str, Trial] = {}
     for pattern in patterns:
         for trial in _matching(path, pattern, out):
@@ -289,7 +297,7 @@ def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
             if first.path != trial.path:
                 raise DataError(
                     f'{path}, key trials: {first.path} and {trial.path} would have the same '
-                    f'results; name one of them, or move it to a folder of its own'
+                    'results; name one of them, or move it to a separate folder'
                 )
     return tuple(trials.values())
 
@@ -302,7 +310,7 @@ def _matching(path: Path, pattern: str, out: Path) -> Sequence[Trial]:
     try:
         paths = sorted(folder.glob(pattern))
     except (ValueError, OSError) as error:
-        raise DataError(f'{path}, key trials: {pattern!r} is no pattern ({error})') from None
+        raise DataError(f'{path}, key trials: {pattern!r} is not a pattern ({error})') from None
     trials = []
     for trial_path in paths:
         relative = trial_path.relative_to(folder)

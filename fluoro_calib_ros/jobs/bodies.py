@@ -151,12 +151,12 @@ class BodiesOptions(RecordedPairing):
 
     smooth: str = option(
         'auto',
-        'how poses are smoothed: by the whole trial without a cutoff (auto), not at all, with the '
-        'exposures up to --lag later as live, or with a Butterworth filter of --cutoff',
+        'smoothing of the poses: over the whole trial without a cutoff (auto), none, over the '
+        'exposures up to --lag later as in live operation, or a Butterworth filter with --cutoff',
         choices=SMOOTH,
     )
     lag: int = option(
-        0, 'exposures that a live pose waits for', minimum=0, maximum=100, unit='exposures'
+        0, 'exposures by which a live pose is delayed', minimum=0, maximum=100, unit='exposures'
     )
     cutoff: float = option(
         10.0, 'cutoff of the Butterworth filter', minimum=0.01, maximum=1e5, unit='Hz'
@@ -398,7 +398,7 @@ def intersected(
     stamps = np.array([entry.stamp_ns for entry in out])
     if len(out) > 1 and not (np.diff(stamps) > 0).all():
         raise DataError(
-            'the exposures have no times, or not in their order; give the rate of the recording'
+            'the exposures have no times, or times out of order; give the rate of the recording'
         )
     sides = np.array([float(max(sizes[name])) for name in names])
     return IntersectedRecording(out, sides, unpaired=unpaired, drift=watch.verdict(), noise=noise)

@@ -21,6 +21,7 @@ from ..checks.check import Validation
 from ..checks.held_out import corrected_already, misfits, poor_fits, uncorrected
 from ..checks.inputs import (
     copied_exposures,
+    exclusion_reason,
     find_wrong_input,
     find_wrong_orientation,
     find_wrong_phantom,
@@ -30,7 +31,6 @@ from ..checks.inputs import (
     valid_frames,
     validate_magnitudes,
     validate_names,
-    why_excluded,
 )
 from ..checks.mixed_units import mixed_units
 from ..checks.rig import RigFindings, interchanged, rig_findings
@@ -291,7 +291,7 @@ def _with_causes(request: CalibrationRequest, result: CalibrationResult) -> list
         if name not in request.known_orientations:
             for frame in frames:
                 if frame.number not in used:
-                    causes[frame.place] = why_excluded(frame, request.phantom)
+                    causes[frame.place] = exclusion_reason(frame, request.phantom)
     return [finding.explained_by(causes.get(finding.place)) for finding in result.findings]
 
 
@@ -418,7 +418,7 @@ def run_in_worker_process(
     RuntimeError for any other failure of the process.
     """
 
-    def told(*arguments: Any) -> None:
+    def report(*arguments: Any) -> None:
         call = progress if isinstance(arguments[-1], Round) else report_step
         if call is not None:
             call(*arguments)
@@ -428,7 +428,7 @@ def run_in_worker_process(
         request,
         validate,
         rig,
-        progress=told,
+        progress=report,
         raise_if_cancelled=raise_if_cancelled,
     )
 

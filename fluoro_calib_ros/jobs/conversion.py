@@ -154,7 +154,7 @@ def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, 
     source = Path(request.source)
     from_bag = not is_result_folder(source) and request.source_kind is None and is_bag(source)
     if request.angles.angle_joint and not request.angles.of_rig and not from_bag:
-        raise DataError(f'{source}: the angle of a joint needs a bag, this is none')
+        raise DataError(f'{source}: the angle of a joint needs a bag, which this is not')
     if is_result_folder(source):
         return result_content(source, settings, request.exposure, request.angle), True
     if request.exposure is not None:
@@ -184,9 +184,7 @@ def _lost_angles(request: ConversionRequest, observations: Frames) -> tuple[str,
     holds_angles = request.kind == 'observations'
     if holds_angles or not has_angle or 'observations' not in _parts_written(request.kind):
         return ()
-    return (
-        f'{request.out}: this format does not hold the angles of the C-arm, they are left out',
-    )
+    return (f'{request.out}: this format has no angles of the C-arm, they are not written',)
 
 
 def _parts_written(kind: str) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
 from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.overlay import small_jpeg
-from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
+from ..images.view import Lens, assumed_lens, lacks_certain_pose, shared_lens
 from ..io.access import check_safe_name, make_folder, write_bytes
 from ..io.bags.reader import image_topics
 from .followers import Observations, PhantomSettings
@@ -146,23 +146,25 @@ def _extract(task: _Task) -> list[ImageResult]:
     return results
 
 
-def _result(found: Observations, source: SourceImage, settings: PhantomSettings) -> ImageResult:
+def _result(
+    observations: Observations, source: SourceImage, settings: PhantomSettings
+) -> ImageResult:
     """Return the observations found in an image as an ImageResult."""
     frame: Frame | None = None
-    if found.finding is None and settings.lens is not None:
+    if observations.finding is None and settings.lens is not None:
         frame = Frame(
             settings.fluoroscope,
             source.exposure,
-            found.target_id,
-            found.uv,
+            observations.target_id,
+            observations.uv,
             settings.lens.image_size,
-            sigma=found.sigma,
+            sigma=observations.sigma,
             angle=source.angle,
         )
     png: bytes | None = None
-    if found.picture is not None:
-        png = cv2.imencode('.png', found.picture)[1].tobytes()
-    values = {**vars(found), 'picture': None}
+    if observations.picture is not None:
+        png = cv2.imencode('.png', observations.picture)[1].tobytes()
+    values = {**vars(observations), 'picture': None}
     return ImageResult(
         **values, exposure=source.exposure, place=source.place, frame=frame, png=png
     )
@@ -181,7 +183,7 @@ def run_extraction(
     """
     sources = open_sources(request.sources, request.fluoroscope, request.angles)
     if request.regular_grid and FlatGrid.of(request.phantom.xyz_mm) is None:
-        raise DataError('the phantom is no flat grid with rows and columns')
+        raise DataError('the phantom is not a flat grid with rows and columns')
     if request.overlay is not None:
         make_folder(request.overlay)
     with open_workers(request.workers, request.scheduler, sources.count) as workers:
@@ -221,10 +223,11 @@ def bent_shadows(fluoroscope: str, results: Sequence[ImageResult]) -> Finding | 
         return None
     return Finding(
         Kind.SHADOWS_BENT,
-        f'the distortion within the large shadows shifts their centres by {bent_px:.3f} px (RMS); '
-        f'some {remaining_px:.3f} px of it may be left in the correction, beyond what that claims',
+        f'the distortion within the large shadows shifts their centres by {bent_px:.3f} px '
+        f'(RMS); some {remaining_px:.3f} px of it may remain in the correction, in addition to '
+        'its standard deviation',
         Place((fluoroscope,)),
-        advice='smaller beads have less of it, with the square of their size',
+        advice='smaller beads reduce it, with the square of their size',
         severity=Severity.WARNING,
         numbers={'bent_px': bent_px, 'left_px': remaining_px},
     )
@@ -262,7 +265,9 @@ def _second_pass(
     results: list[ImageResult],
 ) -> None:
     """Extract refused images again with the distortion of the others; update results in place."""
-    refused = {number for number, result in enumerate(results) if may_be_found(result.finding)}
+    refused = {
+        number for number, result in enumerate(results) if lacks_certain_pose(result.finding)
+    }
     views = [result.view for result in results if result.view is not None]
     lens = shared_lens(views[0].lens, views) if views else None
     if lens is None or not refused:
@@ -388,7 +393,7 @@ def _mirrored(
 
     Two of the images are tried, none of which gives observations as it is.
     """
-    refused = [result.exposure for result in results if may_be_found(result.finding)]
+    refused = [result.exposure for result in results if lacks_certain_pose(result.finding)]
     tried = set(refused[:2])
     for source in sources.images():
         if source.exposure not in tried or isinstance(source.image, DataError):
@@ -397,20 +402,17 @@ def _mirrored(
         task = _task(request, (flipped,), _first_lens(request, flipped.image))
         (result,) = _extract(replace(task, overlay=False))
         if result.frame is not None:
-            cause = (
-                'the image is mirrored, the phantom is found in it when left and right are '
-                'interchanged'
-            )
+            cause = 'the image is mirrored, the phantom is found with left and right interchanged'
             advice = 'flip the images before they are extracted'
             place = Place(name=source.place)
             return _first_of(results, Finding(Kind.IMAGE_MIRRORED, cause, place, advice))
     return None
 
 
-def _first_of(results: Sequence[ImageResult], found: Finding | None) -> Finding:
+def _first_of(results: Sequence[ImageResult], finding: Finding | None) -> Finding:
     """Return why no image gives observations, based on the finding on one of them."""
-    assert found is not None
+    assert finding is not None
     if len(results) == 1:
-        return found
-    name = f'none of {len(results)} images gives observations, {found.place}'
-    return replace(found, place=replace(found.place, name=name))
+        return finding
+    name = f'none of {len(results)} images gives observations, {finding.place}'
+    return replace(finding, place=replace(finding.place, name=name))

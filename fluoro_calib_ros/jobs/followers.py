@@ -31,7 +31,7 @@ from ..images.marker_views import MarkerViews, ViewsFrame
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.matching import PhantomModel
 from ..images.overlay import draw_markers, draw_overlay
-from ..images.view import Lens, View, assumed_lens, may_be_found, shared_lens
+from ..images.view import Lens, View, assumed_lens, lacks_certain_pose, shared_lens
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import OF_STREAM, WorkerProcess
 
@@ -155,7 +155,7 @@ class PhantomFollower:
         except DataError as error:
             is_stream = self._settings.lens is None
             shared = shared_lens(lens, list(self._views)) if is_stream else None
-            if shared is None or not may_be_found(error.finding):
+            if shared is None or not lacks_certain_pose(error.finding):
                 raise
             return extract_beads(image, self._model, shared)
 
@@ -214,8 +214,8 @@ def _model_of(beads: bytes, diameters: bytes | None, regular: bool) -> PhantomMo
 MIN_STARTED = 0.5  # minimum fraction of the given markers found in the first image
 REVISED = 300  # number of last images in which late decisions can retract ids
 DECIDED = {
-    'exchanged': 'were exchanged, which is undone from now on',
-    'dropped': 'is not what was followed, and is searched for',
+    'exchanged': 'were exchanged, which is corrected from now on',
+    'dropped': 'was confused with another object, and is searched for',
 }
 
 
@@ -261,7 +261,7 @@ class MarkerFollower:
         self._renew()
         if not settings.first and not identifiable(settings.bodies):
             raise DataError(
-                'there are neither given markers nor a body of four markers of known places'
+                'there are neither given markers nor a body of four markers with known coordinates'
             )
 
     def _renew(self) -> None:
@@ -282,9 +282,9 @@ class MarkerFollower:
             later=settings.later,
         )
 
-    def place(self, fluoroscope: str, given: FirstMarkers) -> None:
+    def place(self, fluoroscope: str, positions: FirstMarkers) -> None:
         """Follow markers of a view from the positions that a person gives in the next image."""
-        self._begun_views.trackers[fluoroscope].place(given)
+        self._begun_views.trackers[fluoroscope].place(positions)
 
     def update(
         self,
@@ -388,14 +388,14 @@ def _missing_views(names: Sequence[str]) -> Finding:
     return Finding(Kind.OTHER_VIEW_MISSING, f'the {views_text} missing', place)
 
 
-def _wrong_start(found: MarkerFrame, expected: int) -> Finding | None:
+def _wrong_start(markers: MarkerFrame, expected: int) -> Finding | None:
     """Return why the first image does not show the given markers, None if it may do so."""
-    count = len(found.target_id)
-    if found.finding is not None or count >= MIN_STARTED * expected:
-        return found.finding
+    count = len(markers.target_id)
+    if markers.finding is not None or count >= MIN_STARTED * expected:
+        return markers.finding
     return Finding(
         Kind.FEW_MARKERS,
-        f'only {count} of {expected} markers are where they are said to be at first',
+        f'only {count} of {expected} markers are at their given initial positions',
         numbers={'found': count, 'expected': expected},
     )
 
@@ -410,23 +410,23 @@ def _decision_text(decision: Decision) -> str:
     )
 
 
-def _observed(found: MarkerFrame, expected: int) -> Observations:
+def _observed(markers: MarkerFrame, expected: int) -> Observations:
     """Return a MarkerFrame as Observations."""
-    finding = found.finding
-    if finding is None and not len(found.target_id):
+    finding = markers.finding
+    if finding is None and not len(markers.target_id):
         finding = Finding(Kind.NO_MARKERS, 'no marker is seen')
     return Observations(
-        found.target_id,
-        found.uv,
-        found.sigma,
-        found.overlapped,
+        markers.target_id,
+        markers.uv,
+        markers.sigma,
+        markers.overlapped,
         finding=finding,
-        note='; '.join(_doubt_text(doubt) for doubt in found.doubts),
+        note='; '.join(_doubt_text(doubt) for doubt in markers.doubts),
         expected=expected,
-        found=len(found.target_id) / expected,
+        found=len(markers.target_id) / expected,
         explained=1.0,
         followed=finding is None,
-        doubtful=int(found.doubtful.sum()),
+        doubtful=int(markers.doubtful.sum()),
     )
 
 
@@ -434,7 +434,7 @@ def _doubt_text(doubt: Finding) -> str:
     """Return a doubt in words."""
     markers = ' and '.join(map(str, doubt.place.target_id))
     suspicion = (
-        'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be something else'
+        'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be another object'
     )
     return f'markers {markers} {suspicion}: {doubt.cause}'
 

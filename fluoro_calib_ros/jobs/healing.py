@@ -440,13 +440,13 @@ def _cause_text(change: Change, rig: _Rig) -> str:
     return {
         Cause.ORIENTATION: 'it has moved'
         if views > 2
-        else 'it has moved against the other fluoroscope, or that one against it',
-        Cause.INTERIOR: 'source and detector have moved against each other',
+        else 'it has moved relative to the other fluoroscope, or vice versa',
+        Cause.INTERIOR: 'source and detector have moved relative to each other',
         Cause.DISTORTION: 'the distortion has changed',
         Cause.MIGRATED: f'marker {ids} has migrated',
         Cause.EXCHANGED: f'the ids of markers {ids} are exchanged',
-        Cause.LOOSE: f'marker {ids} moves against the others',
-        Cause.SOFT: 'its markers move against each other: it is not rigid',
+        Cause.LOOSE: f'marker {ids} moves relative to the others',
+        Cause.SOFT: 'its markers move relative to each other: it is not rigid',
     }[change.cause]
 
 
@@ -454,8 +454,8 @@ def common_motion(distance_mm: float) -> Finding:
     """Return a finding on the possible common motion of all points [mm]."""
     return Finding(
         Kind.COMMON_MOTION,
-        f'all points together may have moved by {distance_mm:.2f} mm (RMS) in the rig frame, '
-        'which no body shows',
+        f'a common motion of all points by {distance_mm:.2f} mm (RMS) in the rig frame may be '
+        'undetected',
         severity=Severity.NOTE,
         numbers={'distance_mm': distance_mm},
     )
@@ -465,9 +465,8 @@ def _unseen_distortion(distance_mm: float, noise_mm: float) -> Check:
     """Check that changes of distortion that bodies do not show are below the noise."""
     return Check(
         Kind.UNSEEN_DISTORTION,
-        'a change of the distortion that no body shows may have moved points by '
-        f'{distance_mm:.3f} mm (RMS) relative to each other where the markers were, and by more '
-        'elsewhere',
+        f'an undetected change of the distortion may have moved points by {distance_mm:.3f} mm '
+        '(RMS) relative to each other where the markers were, and by more elsewhere',
         advice='record more bodies, or bodies that move through more of the field of view',
         value=distance_mm,
         limit=noise_mm,
@@ -480,8 +479,8 @@ def _identified(weakest: float, is_healed: bool) -> Check:
     change = 'the change' if is_healed else 'a knock'
     return Check(
         Kind.CHANGE_IDENTIFIED,
-        f'the direction of {change} that is known worst has a standard deviation of '
-        f'{100 * weakest:.1f} % of what such a change may be',
+        f'the least certain direction of {change} has a standard deviation of '
+        f'{100 * weakest:.1f} % of the size that such a change may have',
         advice='record bodies that move through more of the field of view',
         value=weakest,
         limit=IDENTIFIED,
@@ -492,7 +491,8 @@ def _correctable(fixed: Sequence[str]) -> Check:
     """Return the failed check for a change of distortion that the models do not allow."""
     return Check(
         Kind.CHANGE_IDENTIFIED,
-        'its model of the distortion has no field of standard deviations, and takes no change',
+        'its model of the distortion has no field of standard deviations, to which a change '
+        'could be added',
         place=Place(tuple(fixed)),
         advice='calibrate with the phantom; the collocation can be healed',
         value=1.0,
@@ -512,7 +512,7 @@ def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
         text = f'{finding.place}: {finding.cause}'
         if rival is not None:
             text += f'; or {_place_of(rival, rig)}: {_cause_text(rival, rig)}'
-        text += '; the recording does not tell which'
+        text += '; the recording does not decide which'
     if not diagnosis.complete:
         doubt = 1.0
         text = f'{len(diagnosis.changes)} changes do not explain the recording'
@@ -537,27 +537,27 @@ def _unused_exposures(
     ]
 
 
-def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
+def _unused(diagnosis_of_unused: Diagnosis | None, half: int, rig: _Rig) -> Check:
     """Check that unused exposures show no further change of the rig."""
     part = f'the {("first", "second")[half - 1]} half of the exposures that were not used'
-    if rest is None:
+    if diagnosis_of_unused is None:
         return Check(
             Kind.UNUSED_EXPOSURES,
             f'{part} shows too little of the bodies',
             advice='take a longer recording',
         )
-    changes = [change for change in rest.changes if change.cause in OF_RIG]
-    text = f'{part} tells of no further change'
+    changes = [change for change in diagnosis_of_unused.changes if change.cause in OF_RIG]
+    text = f'{part} shows no further change'
     if changes:
         text = f'{part}: {_place_of(changes[0], rig)}: {_cause_text(changes[0], rig)}'
-    elif not rest.complete:
-        text = f'{len(rest.changes)} changes do not explain {part}'
+    elif not diagnosis_of_unused.complete:
+        text = f'{len(diagnosis_of_unused.changes)} changes do not explain {part}'
     return Check(
         Kind.UNUSED_EXPOSURES,
         text,
         advice='the rig changes while it is recorded: take another recording, or calibrate with '
         'the phantom',
-        value=float(len(changes) + (not rest.complete)),
+        value=float(len(changes) + (not diagnosis_of_unused.complete)),
         limit=0.0,
     )
 
@@ -606,7 +606,7 @@ def healing_document(outcome: HealingOutcome, parent: RigOrientation) -> dict[st
         'verdict': outcome.verdict,
         'exposures': outcome.exposures,
         'noise_factor': outcome.diagnosis.noise,
-        'nothing_else_probability': outcome.diagnosis.rest,
+        'nothing_else_probability': outcome.diagnosis.no_further_probability,
         'findings': [_finding_document(finding) for finding in outcome.findings],
         'checks': [
             {

@@ -82,7 +82,7 @@ def learn_shapes(
     exposures = recording.exposures
     drift = recording.drift
     if drift.state is not None:
-        raise DataError(replace(drift.finding, advice='no shapes are learned in a drift'))
+        raise DataError(replace(drift.finding, advice='no shapes are learned during a drift'))
     shapes = estimated_shapes(bodies, recording)
     learned = [_known(shape.body) for shape in shapes if _is_good(shape)]
     findings = [finding for shape in shapes for finding in shape.findings]
@@ -109,8 +109,9 @@ def learned_for(directory: PathLike, orientation: RigOrientation) -> LearnedShap
     """
     if not has_learned_shapes(directory):
         raise DataError(
-            f'{directory}: no shapes of bodies were learned while the rig was healthy; they are '
-            'by fluoro-calib bodies --learn, or the parameter learn_bodies of calibration_node'
+            f'{directory}: no shapes of bodies were learned while the rig was healthy; learn '
+            'them with fluoro-calib bodies --learn, or the parameter learn_bodies of '
+            'calibration_node'
         )
     learned = read_learned_shapes(directory)
     with ErrorsAt(directory):

@@ -88,10 +88,10 @@ def orient(
     met = _met(reconstructed, phantom)
     if not met.is_good and _fits_uncorrected(frames, phantom, calibrations, frame_id):
         raise DataError(
-            'the image points are corrected already, their rays meet without the correction '
-            'of the calibrations only',
+            'the image points are already corrected, their rays meet only without the correction '
+            'of the calibrations',
             kind=Kind.CORRECTED_ALREADY,
-            advice='give the observed ones',
+            advice='give the observed image points',
         )
     offset = reconstructed.points.xyz_mm - phantom.xyz_mm[phantom.index(reconstructed.target_id)]
     offset = offset[np.isfinite(offset).all(axis=1)]
@@ -128,11 +128,11 @@ def _intersected(
     return reconstruct_exposure(standing, calibrations, Intersector(orientation))
 
 
-def _met(found: ReconstructedFrame, phantom: Phantom) -> _Met:
+def _met(reconstructed: ReconstructedFrame, phantom: Phantom) -> _Met:
     """Return how well intersected targets fit the phantom."""
-    points = found.points
+    points = reconstructed.points
     matched = int(np.sum(points.rays > 1))
-    rows = phantom.index(found.target_id)
+    rows = phantom.index(reconstructed.target_id)
     offset = points.xyz_mm - phantom.xyz_mm[rows]
     met = np.isfinite(offset).all(axis=1)
     if not met.any():
@@ -169,7 +169,7 @@ def _doubt(met: _Met) -> Finding | None:
         Kind.RAYS_DO_NOT_MEET,
         f'the rays of only {met.met} of {met.matched} targets in two views meet',
         advice='the fluoroscopes are interchanged, their calibrations do not hold for these '
-        'images, or the frames are not of one exposure',
+        'images, or the frames are from different exposures',
         numbers={'met': met.met, 'matched': met.matched, 'ratio': met.ratio},
     )
     if met.met < MIN_MET * met.matched:
@@ -200,11 +200,11 @@ def _change(present: RigOrientation | None, new: RigOrientation) -> Finding | No
             scale = float(np.linalg.norm(shifts[1])) / baseline
             return Finding(
                 Kind.RIG_MOVED,
-                f'fluoroscopes {" and ".join(names)} stand otherwise to each other than in the '
-                f'orientation before, by {moved:.1f} mm and {turned_deg:.2f} degrees (distance of '
+                f'the relative orientation of fluoroscopes {" and ".join(names)} differs from '
+                f'the previous one by {moved:.1f} mm and {turned_deg:.2f} degrees (distance of '
                 f'the sources {scale:.4f} times)',
                 place=Place(names, name=''),
-                advice='one of them was moved since, the frames are not of one exposure, or '
+                advice='one of them was moved since, the frames are from different exposures, or '
                 'this is another phantom',
                 severity=Severity.WARNING,
                 numbers={'shift_mm': moved, 'turn_deg': turned_deg, 'scale': scale},

@@ -244,8 +244,8 @@ def print_page(page: PathLike, out: PathLike) -> None:
     browser = find_browser()
     if browser is None:
         raise DataError(
-            f'{out}: neither Chromium, Chrome nor Edge is installed, which print the report; open '
-            f'{page} in any other browser and print it from there'
+            f'{out}: printing the report needs Chromium, Chrome or Edge, but none is installed; '
+            f'open {page} in any other browser and print it from there'
         )
     with tempfile.TemporaryDirectory() as folder:
         printed = Path(folder) / 'page.pdf'

@@ -83,8 +83,8 @@ class LocalWorkers:
             )
         except ProcessEnded:
             raise DataError(
-                'a worker process was ended from outside, perhaps for want of memory; start again '
-                'with fewer processes (--workers)'
+                'a worker process was terminated, perhaps for lack of memory; start again with '
+                'fewer processes (--workers)'
             ) from None
 
     def _call(self, function: Callable[[Task], Result], task: Task) -> Result:
@@ -147,9 +147,9 @@ class Cluster:
             raise DataError(f'{self.scheduler}: certificates are for a scheduler tls://HOST:PORT')
         if not self.trusted_network and not _is_of_this_machine(self.scheduler):
             raise DataError(
-                f'{self.scheduler}: whoever reaches this scheduler can run code here; start it '
-                'with TLS (tls://HOST:PORT, --tls-ca, --tls-cert, --tls-key), or say that you '
-                'trust all of its network: --trusted-network'
+                f'{self.scheduler}: anyone who reaches this scheduler can run code here; start '
+                'it with TLS (tls://HOST:PORT, --tls-ca, --tls-cert, --tls-key), or trust all of '
+                'its network with --trusted-network'
             )
         return None
 

@@ -382,7 +382,7 @@ class SimulationOptions:
     )
     test_exposures: int = option(
         0,
-        'further exposures, in a bag and CSV file of their own',
+        'further exposures, in a separate bag and CSV file',
         minimum=0,
         maximum=100000,
     )

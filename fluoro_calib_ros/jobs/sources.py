@@ -108,18 +108,18 @@ class BagSelection:
                 'angle_deg'
             )
 
-    def frames(self, path: object, found: Frames) -> dict[str, list[Frame]]:
+    def frames(self, path: object, recorded: Frames) -> dict[str, list[Frame]]:
         """Return the frames in the time window. Raises DataError if a fluoroscope has none."""
-        origin = min(frame.stamp_ns for frames in found.values() for frame in frames)
+        origin = min(frame.stamp_ns for frames in recorded.values() for frame in frames)
         low = -math.inf if self.start_s is None else self.start_s
         high = math.inf if self.end_s is None else self.end_s
         selected = {
             name: [frame for frame in frames if low <= (frame.stamp_ns - origin) * 1e-9 <= high]
-            for name, frames in found.items()
+            for name, frames in recorded.items()
         }
         for name, frames in selected.items():
             if not frames:
-                last = max(frame.stamp_ns for frame in found[name])
+                last = max(frame.stamp_ns for frame in recorded[name])
                 raise DataError(
                     f'{path}: there is no frame of fluoroscope {name} in the time window, its '
                     f'last frame is at {(last - origin) * 1e-9:.3f} s'
@@ -276,8 +276,8 @@ def with_decisions(recording: Recording, path: PathLike | None) -> Recording:
     decisions = read_decisions(path, recording.names)
     frames, (exposures, points, renamed) = decided(recording.frames, decisions)
     note = (
-        f'{path}: by decision, {exposures} exposures and {points} further image points are left '
-        f'out, and {renamed} have another id'
+        f'{path}: by decision, {exposures} exposures and {points} further image points are '
+        f'excluded, and {renamed} have another id'
     )
     return replace(recording, frames=frames, notes=(*recording.notes, note))
 
@@ -337,9 +337,9 @@ def require_observed(path: object, corrected_by: Mapping[str, str]) -> None:
     """Raise DataError for image points that are already corrected by a calibration."""
     for name, identity in corrected_by.items():
         raise DataError(
-            f'{path}: the image points of fluoroscope {name} are corrected already, by the '
-            f'calibration {identity}: give the observed ones, or remove the column '
-            f'{CORRECTED_BY} where this is not so'
+            f'{path}: the image points of fluoroscope {name} are already corrected, by the '
+            f'calibration {identity}: give the observed image points, or remove the column '
+            f'{CORRECTED_BY} if this is wrong'
         )
 
 

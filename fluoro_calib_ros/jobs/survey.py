@@ -173,9 +173,9 @@ def _free_network(
     Raises DataError.
     """
 
-    def adjusted(given: Phantom, force: bool) -> CalibrationResult:
+    def adjusted(initial: Phantom, force: bool) -> CalibrationResult:
         return run_calibration(
-            request.calibration_of(request.frames, given),
+            request.calibration_of(request.frames, initial),
             force=force,
             progress=progress,
         ).result
@@ -189,16 +189,16 @@ def _free_network(
         refused = error
     try:
         rough = adjusted(request.given, force=True)
-        return adjusted(_with_found(request.given, rough), force=False)
+        return adjusted(_with_adjusted(request.given, rough), force=False)
     except DataError:
         raise refused from None
 
 
-def _with_found(given: Phantom, result: CalibrationResult) -> Phantom:
+def _with_adjusted(initial: Phantom, result: CalibrationResult) -> Phantom:
     """Return the given coordinates, replaced where an adjustment found others."""
-    xyz = given.xyz_mm.copy()
-    xyz[given.index(result.targets.target_id)] = result.targets.xyz_mm
-    return replace(given, xyz_mm=xyz)
+    xyz = initial.xyz_mm.copy()
+    xyz[initial.index(result.targets.target_id)] = result.targets.xyz_mm
+    return replace(initial, xyz_mm=xyz)
 
 
 def _halves(
@@ -217,7 +217,7 @@ def _halves(
     # Start from the better coordinates found so far. The scale is not compared, so exclude its
     # uncertainty.
     start = replace(
-        _with_found(request.given, result), sd_mm=np.full(len(request.given.sd_mm), EXACT_SD_MM)
+        _with_adjusted(request.given, result), sd_mm=np.full(len(request.given.sd_mm), EXACT_SD_MM)
     )
     surveys = []
     for half in (set(numbers[::2]), set(numbers[1::2])):

@@ -78,9 +78,11 @@ class AngleInput:
         message = f'a message on {TOPIC}'
         return FaultHandlers(
             lambda _: self._refuse(f'{message} cannot be decoded'),
-            lambda _, error: self._refuse(f'{message} is lost by an internal error: {error!r}'),
+            lambda _, error: self._refuse(
+                f'{message} is lost due to an internal error: {error!r}'
+            ),
             faults.reader_error,
-            lambda _, size: self._refuse(f'{message} has {size} bytes, more than are read'),
+            lambda _, size: self._refuse(f'{message} has {size} bytes, more than the limit'),
         )
 
     def of_frame(self, name: str, stamp_ns: int, needed: bool) -> float | None:

@@ -75,7 +75,7 @@ class Admission:
         fields = (line.partition(':') for line in lines)
         headers = {name.strip().lower(): value.strip() for name, _, value in fields}
         if len(words) != 3 or words[0] != 'GET':
-            return 'this is no request of a WebSocket'
+            return 'this is not a WebSocket request'
         with suppress(ValueError):
             token = parse_qs(urlsplit(words[1]).query).get('token', [''])[0]
             if hmac.compare_digest(token.encode(), self.token.encode()):
@@ -170,7 +170,7 @@ class BridgeParameters:
     port: int = option(8765, 'port of the WebSocket; 0: any free one', minimum=0, maximum=65535)
     topics: tuple[str, ...] = option(('',), 'topics to show; empty: all')
     token: str = option(
-        '', 'what the address of a client ends with, ?token=...; empty: a new one at every start'
+        '', 'token that ends the address of a client, ?token=...; empty: a new one at every start'
     )
     origins: tuple[str, ...] = option(
         ('https://app.foxglove.dev',), 'web pages that may connect; others are refused'

@@ -276,11 +276,11 @@ class SelfCalibration(Job):
         self,
         request: Request,
         result: Result,
-        tell: Callable[[SelfCalibrate.Feedback], None],
+        publish: Callable[[SelfCalibrate.Feedback], None],
         is_cancel_requested: Callable[[], bool],
     ) -> None:
         try:
-            outcome = await self._start(request, tell, is_cancel_requested)
+            outcome = await self._start(request, publish, is_cancel_requested)
             self._use(outcome, result)
             if request.validate and not self._output.save_fault:
                 await self._write_report()
@@ -293,7 +293,7 @@ class SelfCalibration(Job):
     def _start(
         self,
         request: Request,
-        tell: Callable[[SelfCalibrate.Feedback], None],
+        publish: Callable[[SelfCalibrate.Feedback], None],
         is_cancel_requested: Callable[[], bool],
     ) -> Future:
         """Start a calibration in a worker process; return the Future of its CalibrationOutcome.
@@ -305,7 +305,7 @@ class SelfCalibration(Job):
 
         def on_round(label: str, last: Round) -> None:
             self.last_round.update(dict.fromkeys(label.split('+'), last))
-            tell(feedback_of_round(label, last))
+            publish(feedback_of_round(label, last))
 
         def run() -> CalibrationOutcome:
             return run_in_worker_process(
@@ -313,7 +313,7 @@ class SelfCalibration(Job):
                 validate=request.validate,
                 rig=rig,
                 progress=on_round,
-                report_step=lambda stage, step, steps: tell(
+                report_step=lambda stage, step, steps: publish(
                     SelfCalibrate.Feedback(stage=stage, step=step, steps=steps)
                 ),
                 raise_if_cancelled=lambda: self._raise_if_cancelled(is_cancel_requested()),

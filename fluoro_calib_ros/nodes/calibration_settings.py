@@ -88,7 +88,7 @@ class CalibrationParameters(ManagedParameters):
     )
     capture_timeout: float = option(
         5.0,
-        'longest wait of capture and orient where the request leaves it open',
+        'longest wait of capture and orient where the request gives none',
         minimum=0.1,
         maximum=600.0,
         unit='s',
@@ -96,7 +96,7 @@ class CalibrationParameters(ManagedParameters):
     learn_bodies: str = option(
         '',
         'bodies.csv: bodies whose shapes are learned from the stream while the rig is healthy, '
-        'for the action heal; places of markers may be left empty; empty: none are learned',
+        'for the action heal; coordinates of markers may be empty; empty: none are learned',
     )
     learn_time: float = option(
         30.0,
@@ -107,7 +107,7 @@ class CalibrationParameters(ManagedParameters):
     )
     heal_time: float = option(
         5.0,
-        'how long heal collects frames where the goal leaves it open',
+        'how long heal collects frames where the goal gives no time',
         minimum=0.1,
         maximum=60.0,
         unit='s',

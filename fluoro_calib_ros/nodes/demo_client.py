@@ -123,12 +123,12 @@ class DemoClient(Node):
             raise DemoError(answer.result.message)
         return answer.result.message
 
-    def wait(self, condition: Callable[[], Any], timeout_s: float, what: str) -> None:
+    def wait(self, condition: Callable[[], Any], timeout_s: float, description: str) -> None:
         """Spin until a condition is true. Raises DemoError if time runs out."""
         end = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > end:
-                raise DemoError(f'waited {timeout_s:g} s for {what}')
+                raise DemoError(f'waited {timeout_s:g} s for {description}')
             rclpy.spin_once(self, timeout_sec=0.1)
 
     def destroy_node(self) -> None:
@@ -136,8 +136,8 @@ class DemoClient(Node):
         self._streams.stop()
         super().destroy_node()
 
-    def _result_of(self, future: Future, timeout_s: float, what: str) -> Any:
-        self.wait(future.done, timeout_s, what)
+    def _result_of(self, future: Future, timeout_s: float, description: str) -> Any:
+        self.wait(future.done, timeout_s, description)
         return future.result()
 
     def _subscribe_streams(self) -> None:

@@ -206,7 +206,7 @@ class ExposureInput:
         """Add a small radiograph; refuse data that is too large or no JPEG."""
         jpeg = bytes(message.data)
         if len(jpeg) > MEGABYTE or not jpeg.startswith(JPEG_START):
-            error = DataError(f'{name}/{RADIOGRAPH}: this is no small JPEG')
+            error = DataError(f'{name}/{RADIOGRAPH}: this is not a small JPEG')
             self.streams[name].refusals.refuse(error)
             return
         with self._lock:

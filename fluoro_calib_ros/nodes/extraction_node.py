@@ -76,7 +76,7 @@ MODES = ('phantom', 'markers')
 class ExtractionParameters(ManagedParameters):
     """Parameters of the extraction node."""
 
-    mode: str = option('phantom', 'what is looked for in the images', choices=MODES)
+    mode: str = option('phantom', 'what is extracted from the images', choices=MODES)
     phantom: str = option(
         '',
         'file phantom.csv with the surveyed coordinates of the beads, and with a column diameter '
@@ -85,7 +85,7 @@ class ExtractionParameters(ManagedParameters):
     )
     markers: str = option(
         '',
-        'for the mode markers: file with the ids of the markers and where they are in the first '
+        'for the mode markers: file with the ids and image points of the markers in the first '
         'image, as for fluoro-calib extract --markers; until an image shows them there, the node '
         'waits',
     )
@@ -93,7 +93,7 @@ class ExtractionParameters(ManagedParameters):
         '',
         'for the mode markers: folder with the calibrations and the orientation of all '
         'fluoroscopes, whose views then decide together on ids that may have been exchanged; '
-        'empty: each view by itself',
+        'empty: each view separately',
     )
     clusters: tuple[str, ...] = option(
         ('',),
@@ -102,9 +102,9 @@ class ExtractionParameters(ManagedParameters):
     )
     bodies: str = option(
         '',
-        'for the mode markers and two views or more: bodies.csv with rigid bodies and the places '
-        'of their markers, in the place of clusters; without the file markers, the shapes give '
-        'the ids',
+        'for the mode markers and two views or more: bodies.csv with rigid bodies and the '
+        'coordinates of their markers, instead of clusters; without the file markers, the shapes '
+        'give the ids',
     )
     principal_distance: float = option(
         0.0,
@@ -118,7 +118,7 @@ class ExtractionParameters(ManagedParameters):
     )
     queue_size: int = option(
         32,
-        'images of a fluoroscope that may wait; of more, the oldest exposure is shed; 1 for the '
+        'images of a fluoroscope that may wait; beyond that, the oldest exposure is shed; 1: '
         'least delay',
         minimum=1,
         maximum=10000,
@@ -319,29 +319,29 @@ class ExtractionNode(StreamNode):
         return bool(self._overlays[name].get_subscription_count())
 
     def _finish(
-        self, stream: ImageStream, task: Task, image: np.ndarray, found: Observations
+        self, stream: ImageStream, task: Task, image: np.ndarray, observed: Observations
     ) -> None:
         """Publish the targets found in an image, and count it."""
         header = task.message.header
-        if not found.reason:
+        if not observed.reason:
             self._publish_radiograph(stream.name, header, image)
             frame = Frame(
                 stream.name,
                 task.number,
-                found.target_id,
-                found.uv,
+                observed.target_id,
+                observed.uv,
                 (image.shape[1], image.shape[0]),
-                sigma=found.sigma,
+                sigma=observed.sigma,
                 stamp_ns=nanoseconds_from_stamp(header.stamp),
                 frame_id=header.frame_id,
             )
             self._observations[stream.name].publish(message_from_frame(frame))
             stream.add_latency(task.received_ns)
-        self._retract(stream, task, found)
-        stream.count(task.message, found)
-        if found.picture is not None:
+        self._retract(stream, task, observed)
+        stream.count(task.message, observed)
+        if observed.picture is not None:
             self._overlays[stream.name].publish(
-                message_from_image(header, np.ascontiguousarray(found.picture))
+                message_from_image(header, np.ascontiguousarray(observed.picture))
             )
 
     def _publish_radiograph(self, name: str, header: Header, image: np.ndarray) -> None:
@@ -351,11 +351,11 @@ class ExtractionNode(StreamNode):
             jpeg = array('B', small_jpeg(image, RADIOGRAPH_PX))
             publisher.publish(CompressedImage(header=header, format='jpeg', data=jpeg))
 
-    def _retract(self, stream: ImageStream, task: Task, found: Observations) -> None:
+    def _retract(self, stream: ImageStream, task: Task, observed: Observations) -> None:
         """Publish which ids of earlier images are retracted."""
         headers = stream.headers
         remember(headers, task.number, task.message.header, REVISED)
-        for retraction in found.retracted:
+        for retraction in observed.retracted:
             if retraction.frame not in headers:
                 continue
             message = Retraction(header=headers[retraction.frame], frame_number=retraction.frame)

@@ -164,7 +164,9 @@ class Healing(Job):
         """Collect frames, diagnose what has changed, and keep the outcome."""
         seconds = goal.request.seconds or self._rig.settings().node.heal_time
         if not 0 < seconds <= MAX_SECONDS:
-            raise DataError(f'seconds is above 0 and at most {MAX_SECONDS:g}, not {seconds:g}')
+            raise DataError(
+                f'seconds must be above 0 and at most {MAX_SECONDS:g}, not {seconds:g}'
+            )
         rig = self._present_rig()
         self._healed = None
 
@@ -206,11 +208,11 @@ class Healing(Job):
         """Return the frames of the next seconds, fewer if the goal is cancelled."""
         collection = MarkerCollection(rig.learned.bodies, rig.calibrations)
 
-        def tell() -> None:
+        def publish() -> None:
             goal.publish_feedback(Heal.Feedback(stage='collecting', frames=collection.count))
 
-        tell()
-        timer = self._node.create_timer(0.5, tell)
+        publish()
+        timer = self._node.create_timer(0.5, publish)
         self._collection = collection
         try:
             await within(self._node, seconds, collection.done, collection.finish)

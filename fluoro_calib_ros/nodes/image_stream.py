@@ -91,18 +91,18 @@ class ImageStream(Stream):
             )
         return image
 
-    def count(self, message: Image | CompressedImage, found: Observations) -> None:
+    def count(self, message: Image | CompressedImage, observations: Observations) -> None:
         """Count a processed image, and log what is wrong with it."""
-        if not found.reason:
+        if not observations.reason:
             self.extracted += 1
-            self.followed += found.followed
+            self.followed += observations.followed
         else:
             self.without += 1
-            self._note(message, f'no observations: {found.reason}')
-        if found.note:
-            self._note(message, found.note)
-        self.last = found
-        self.seconds += found.seconds
+            self._note(message, f'no observations: {observations.reason}')
+        if observations.note:
+            self._note(message, observations.note)
+        self.last = observations
+        self.seconds += observations.seconds
 
     def _note(self, message: Image | CompressedImage, text: str) -> None:
         self.refusals.note(str(self.converter.refusal('', message, text)))

@@ -338,7 +338,7 @@ def predicted_body(state: BodyState) -> Health | None:
 
 def ambiguous_body(state: BodyState) -> Health | None:
     """Warn if the markers fit a second pose."""
-    text = 'its markers fit in a second pose, too'
+    text = 'its markers also fit in a second pose'
     return warning(text if state.status == PoseStatus.AMBIGUOUS else '')
 
 

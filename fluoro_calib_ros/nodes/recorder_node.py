@@ -54,8 +54,8 @@ class RecorderParameters:
     topics: tuple[str, ...] = option(('',), 'topics to record; empty: all')
     angle_joint: str = option(
         '',
-        'joint of the C-arm, as for the correction node: where it is set, joint_states is '
-        'recorded beside topics',
+        'joint of the C-arm, as for the correction node; if set, joint_states is recorded in '
+        'addition to topics',
     )
 
 

@@ -34,7 +34,7 @@ class _Published:
     """Bodies of an exposure, and the names of those whose poses were retracted."""
 
     content: BodiesContent
-    taken: set[str] = field(default_factory=set)
+    retracted: set[str] = field(default_factory=set)
 
 
 class BodyRetractions:
@@ -76,12 +76,12 @@ class BodyRetractions:
         rows = [
             row
             for row, (poses, used) in enumerate(zip(content.poses, content.used))
-            if poses.body not in published.taken and np.isin(used, retracted_ids).any()
+            if poses.body not in published.retracted and np.isin(used, retracted_ids).any()
         ]
         if not rows:
             return
         bodies = {content.poses[row].body for row in rows}
-        published.taken |= bodies
+        published.retracted |= bodies
         self.count += len(rows)
         self._publish(
             content._replace(

@@ -139,7 +139,7 @@ class RigInput:
             self._refusals.last_fault = str(error)
             self._logger.error(f'orientation refused, the current one stays in use: {error}')
             return False
-        self._tell_jump(orientation)
+        self._log_jump(orientation)
         ids = orientation.calibration_ids
         newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
         self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
@@ -153,7 +153,7 @@ class RigInput:
         except ValueError as error:  # DataError among them
             self._logger.error(f'orientation as calibrated refused: {error}')
 
-    def _tell_jump(self, orientation: rig_orientation.RigOrientation) -> None:
+    def _log_jump(self, orientation: rig_orientation.RigOrientation) -> None:
         """Log how far the transforms of the rig jump with a new orientation."""
         if self.newest is None:
             return
@@ -324,16 +324,16 @@ class BodyFollower:
             return []
         return [self._content(exposure) for exposure in self._tracker.flush()]
 
-    def _content(self, found: TrackedExposure) -> BodiesContent:
+    def _content(self, tracked: TrackedExposure) -> BodiesContent:
         """Return poses and joints of an exposure, and update the state."""
         assert self._rig is not None
-        poses = poses_of(self.bodies, [found])
+        poses = poses_of(self.bodies, [tracked])
         by_name = {pose.body: pose for pose in poses}
-        self._note(found)
-        twist, twist_covariance = twists_of(self.bodies, found)
+        self._note(tracked)
+        twist, twist_covariance = twists_of(self.bodies, tracked)
         return BodiesContent(
-            stamp_ns=found.stamp_ns,
-            frame_number=found.number,
+            stamp_ns=tracked.stamp_ns,
+            frame_number=tracked.number,
             orientation_id=self._rig.orientation_id,
             orientation=self._rig.orientation,
             bodies=self.bodies,
@@ -346,13 +346,13 @@ class BodyFollower:
             ],
             used=[
                 body.target_id[used[: len(body.target_id)]]
-                for body, used in zip(self.bodies, found.frame.used)
+                for body, used in zip(self.bodies, tracked.frame.used)
             ],
         )
 
-    def _note(self, found: TrackedExposure) -> None:
+    def _note(self, tracked: TrackedExposure) -> None:
         """Update the state with an exposure."""
-        frame = found.frame
+        frame = tracked.frame
         known = frame.alone & (frame.freedom > 0)
         newest = np.where(known, [frame.chi2, frame.freedom], 0.0)
         self._squares = (1 - FORGETTING * known) * self._squares + FORGETTING * newest
@@ -360,9 +360,9 @@ class BodyFollower:
         chi2, expected = self._squares
         markers = frame.markers
         self.state = BodiesState(
-            found.stamp_ns,
-            found.status,
+            tracked.stamp_ns,
+            tracked.status,
             markers,
-            seen_ns=np.where(markers > 0, found.stamp_ns, before),
+            seen_ns=np.where(markers > 0, tracked.stamp_ns, before),
             misfit=np.where(expected > 0, chi2 / np.where(expected > 0, expected, 1.0), np.nan),
         )

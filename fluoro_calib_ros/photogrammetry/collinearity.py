@@ -148,7 +148,7 @@ class AdditionalParameters:
     functions: NDArray[np.float64]
     prior: NDArray[np.float64]  #: (P, P) precision matrix of the coefficients; zeros for no prior
     #: with functions (N, k): functions of groups of image points, whose coefficients are the last
-    own: GroupedFunctions | None = None
+    grouped: GroupedFunctions | None = None
 
     @property
     def _common(self) -> int:
@@ -158,7 +158,7 @@ class AdditionalParameters:
     @property
     def count(self) -> int:
         """Number P of coefficients."""
-        return self._common + (0 if self.own is None else self.own.count)
+        return self._common + (0 if self.grouped is None else self.grouped.count)
 
     @cached_property
     def _contiguous(self) -> NDArray[np.float64]:
@@ -176,9 +176,11 @@ class AdditionalParameters:
         """Return the corrections (N, 2) [px] for coefficients (P,)."""
         common = coefficients[: self._common]
         out = np.stack([f @ common[columns] for f, columns in self._by_axis()], axis=1)
-        if self.own is not None:
-            point_coefficients = self.own.split(coefficients[self._common :])[self.own.group]
-            out += (self.own.values @ point_coefficients[:, :, None])[:, :, 0]
+        if self.grouped is not None:
+            point_coefficients = self.grouped.split(coefficients[self._common :])[
+                self.grouped.group
+            ]
+            out += (self.grouped.values @ point_coefficients[:, :, None])[:, :, 0]
         return out
 
     def normal_matrix(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -192,8 +194,8 @@ class AdditionalParameters:
                 lower = blas.dsyrk(1.0, weighted.T, lower=1)
                 out[:k, :k] = mirror_lower(lower)
                 out[k : 2 * k, k : 2 * k] = out[:k, :k]
-            if self.own is not None:
-                self._add_own(self.own, weight, out)
+            if self.grouped is not None:
+                self._add_grouped(self.grouped, weight, out)
             return out
         lower = out.T
         for f, _ in self._by_axis():
@@ -201,14 +203,14 @@ class AdditionalParameters:
             lower = blas.dsyrk(1.0, weighted.T, beta=1.0, c=lower, lower=1, overwrite_c=1)
         return mirror_lower(lower)
 
-    def _add_own(
-        self, own: GroupedFunctions, weight: NDArray[np.float64], out: NDArray[np.float64]
+    def _add_grouped(
+        self, grouped: GroupedFunctions, weight: NDArray[np.float64], out: NDArray[np.float64]
     ) -> None:
         """Fill in the rows and columns of functions of groups in a normal matrix."""
-        weighted = weight[:, None, None] * own.values
-        groups = int(own.group[-1]) + 1
-        products = self.grouped_products(own.group, groups, weighted)
-        rows = products.reshape(own.count, self.count)
+        weighted = weight[:, None, None] * grouped.values
+        groups = int(grouped.group[-1]) + 1
+        products = self.grouped_products(grouped.group, groups, weighted)
+        rows = products.reshape(grouped.count, self.count)
         out[self._common :] = rows
         out[: self._common, self._common :] = rows[:, : self._common].T
 
@@ -217,9 +219,9 @@ class AdditionalParameters:
         out = np.zeros(self.count)
         for axis, (f, columns) in enumerate(self._by_axis()):
             out[: self._common][columns] += values[:, axis] @ f
-        if self.own is not None:
-            products = (values[:, None] @ self.own.values)[:, 0]
-            np.add.at(self.own.split(out[self._common :]), self.own.group, products)
+        if self.grouped is not None:
+            products = (values[:, None] @ self.grouped.values)[:, 0]
+            np.add.at(self.grouped.split(out[self._common :]), self.grouped.group, products)
         return out
 
     def _ordered(self, index: NDArray[np.int64]) -> _Ordered:
@@ -260,8 +262,8 @@ class AdditionalParameters:
                 shape = (count * q, n)
                 summation = sparse.csc_matrix((a[:, axis].ravel(), rows, starts), shape=shape)
                 flat += summation @ self._contiguous[axis]
-        if self.own is not None:
-            functions = self.own
+        if self.grouped is not None:
+            functions = self.grouped
             groups = int(functions.group[-1]) + 1
             products = (a.transpose(0, 2, 1) @ functions.values).reshape(n, -1)
             pairs = index * groups + functions.group
@@ -286,8 +288,8 @@ class AdditionalParameters:
             out[:, i, i] = np.einsum('np,np->n', f @ common[columns, columns], f)
         out[:, 0, 1] = np.einsum('np,np->n', fu @ common[cu, cv], fv)
         out[:, 1, 0] = out[:, 0, 1]
-        if self.own is not None:
-            out += self._own_covariance(self.own, covariance, part)
+        if self.grouped is not None:
+            out += self._grouped_covariance(self.grouped, covariance, part)
         return out
 
     def correction_variance(
@@ -303,18 +305,18 @@ class AdditionalParameters:
             out = np.zeros(len(self.functions[part]))
             for f, _ in self._by_axis():
                 out += np.einsum('np,np->n', f[part] @ common, f[part])
-        if self.own is not None:
-            own_covariance = self._own_covariance(self.own, covariance, part)
+        if self.grouped is not None:
+            own_covariance = self._grouped_covariance(self.grouped, covariance, part)
             out += np.trace(own_covariance, axis1=1, axis2=2)
         return out
 
-    def _own_covariance(
-        self, own: GroupedFunctions, covariance: NDArray[np.float64], part: slice
+    def _grouped_covariance(
+        self, grouped: GroupedFunctions, covariance: NDArray[np.float64], part: slice
     ) -> NDArray[np.float64]:
         """Return the part (n, 2, 2) of group functions in the covariances of the corrections."""
-        values = own.values[part]
-        group = own.group[part]
-        t = own.values.shape[2]
+        values = grouped.values[part]
+        group = grouped.group[part]
+        t = grouped.values.shape[2]
         rows = covariance[self._common :]
         with_common = rows[:, : self._common].reshape(-1, t, self._common)
         mixed = values @ self._common_cross_covariance(with_common, group, part)
@@ -334,10 +336,10 @@ class AdditionalParameters:
         that belongs to each image point.
         """
         out = self._common_cross_covariance(covariance[:, :, : self._common], index, part)
-        if self.own is not None:
-            by_group = self.own.split(covariance[:, :, self._common :])
-            covariance_of_point = by_group[index, :, self.own.group[part]]
-            out += covariance_of_point @ self.own.values[part].transpose(0, 2, 1)
+        if self.grouped is not None:
+            by_group = self.grouped.split(covariance[:, :, self._common :])
+            covariance_of_point = by_group[index, :, self.grouped.group[part]]
+            out += covariance_of_point @ self.grouped.values[part].transpose(0, 2, 1)
         return out
 
     def _common_cross_covariance(

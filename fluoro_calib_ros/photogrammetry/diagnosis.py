@@ -246,7 +246,7 @@ def describe_directions(directions: Sequence[Sequence[str]]) -> str:
                 f'{named} cannot be separated from the orientation of {first_few(exposures)}'
             )
         elif exposures:
-            parts.append(f'the orientation of {first_few(exposures)} is left open')
+            parts.append(f'the orientation of {first_few(exposures)} is undetermined')
         else:
             parts.append(f'{named} cannot be separated')
     return '; '.join(dict.fromkeys(parts))

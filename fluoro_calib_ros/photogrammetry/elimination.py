@@ -32,41 +32,41 @@ class BorderedSystem:
 
     blocks: NDArray[np.float64]  #: (k, s, s) B: blocks of the eliminated unknowns
     border: NDArray[np.float64]  #: (k, s, q) C: their mixed blocks with the remaining unknowns
-    rest: NDArray[np.float64]  #: (q, q) D: normal matrix of the remaining unknowns
+    remaining: NDArray[np.float64]  #: (q, q) D: normal matrix of the remaining unknowns
     block_right: NDArray[np.float64]  #: (k, s) right side b
     rest_right: NDArray[np.float64]  #: (q,) right side r
 
     def damped(self, mu: float) -> BorderedSystem:
         """Return a copy with the diagonal multiplied by 1 + mu."""
         blocks = self.blocks + mu * self.blocks * np.eye(self.blocks.shape[1])
-        rest = self.rest.copy()
-        rest.ravel()[:: len(rest) + 1] *= 1 + mu
-        return replace(self, blocks=blocks, rest=rest)
+        remaining = self.remaining.copy()
+        remaining.ravel()[:: len(remaining) + 1] *= 1 + mu
+        return replace(self, blocks=blocks, remaining=remaining)
 
     def predicted_decrease(
-        self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64], mu: float
+        self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64], mu: float
     ) -> float:
         """Return the decrease of the linearised cost by a step damped by mu.
 
         Not finite if the step is too large for floating point.
         """
         with np.errstate(over='ignore', invalid='ignore'):
-            undamped = np.sum(x_blocks * self.block_right) + np.sum(x_rest * self.rest_right)
+            undamped = np.sum(x_blocks * self.block_right) + np.sum(x_remaining * self.rest_right)
             damping = mu * (
                 np.einsum('ki,kii,ki', x_blocks, self.blocks, x_blocks)
-                + np.sum(x_rest * x_rest * np.diag(self.rest))
+                + np.sum(x_remaining * x_remaining * np.diag(self.remaining))
             )
             return float((undamped + damping) / 2)
 
     def singular_schur_complement(self) -> NDArray[np.float64]:
         """Return the Schur complement (q, q) by pseudo-inverses, as the blocks may be singular."""
         inverse = np.linalg.pinv(self.blocks, hermitian=True)
-        size = len(self.rest)
+        size = len(self.remaining)
         flat = self.border.reshape(-1, size)
-        return self.rest - flat.T @ (inverse @ self.border).reshape(-1, size)
+        return self.remaining - flat.T @ (inverse @ self.border).reshape(-1, size)
 
     def factorize(self) -> BorderedFactor:
-        """Return Cholesky factors of the system; overwrites `rest`.
+        """Return Cholesky factors of the system; overwrites `remaining`.
 
         Raises numpy.linalg.LinAlgError if the matrix is not positive definite, and ValueError if
         it is not finite.
@@ -77,7 +77,9 @@ class BorderedSystem:
             return BorderedFactor(inverse, half, np.zeros((0, 0)))
         # BLAS stores by columns, where `half` is its own transpose: no copy is made, and dsyrk
         # takes half the operations of a full product.
-        schur = blas.dsyrk(-1.0, half.T, beta=1.0, c=self.rest.T, trans=0, lower=1, overwrite_c=1)
+        schur = blas.dsyrk(
+            -1.0, half.T, beta=1.0, c=self.remaining.T, trans=0, lower=1, overwrite_c=1
+        )
         return BorderedFactor(inverse, half, cho_factor(schur, lower=True, overwrite_a=True)[0])
 
 
@@ -97,22 +99,22 @@ class BorderedFactor:
         """Return x_b (k, s, d) and x_r (q, d) for right sides (k, s, d) and (q, d)."""
         columns = block_right.shape[2]
         half = (self.inverse @ block_right).reshape(-1, columns)
-        x_rest = cho_solve((self.schur, True), rest_right - self.half_border.T @ half)
-        remaining = (half - self.half_border @ x_rest).reshape(block_right.shape)
-        return self.inverse.transpose(0, 2, 1) @ remaining, x_rest
+        x_remaining = cho_solve((self.schur, True), rest_right - self.half_border.T @ half)
+        remaining = (half - self.half_border @ x_remaining).reshape(block_right.shape)
+        return self.inverse.transpose(0, 2, 1) @ remaining, x_remaining
 
     def covariance(self) -> BorderedCovariance:
         """Return the blocks of the inverse of the matrix."""
         k, size = self.inverse.shape[:2]
         q = len(self.schur)
         lower, _ = lapack.dpotri(self.schur, lower=1)
-        rest = mirror_lower(lower).T  # stored by rows
+        remaining = mirror_lower(lower).T  # stored by rows
         transposed = self.inverse.transpose(0, 2, 1)
         gain = transposed @ self.half_border.reshape(k, size, q)
-        border = -(gain.reshape(-1, q) @ rest).reshape(k, size, q)
+        border = -(gain.reshape(-1, q) @ remaining).reshape(k, size, q)
         conditional = transposed @ self.inverse
         blocks = conditional - border @ gain.transpose(0, 2, 1)
-        return BorderedCovariance(blocks, border, rest, conditional, gain)
+        return BorderedCovariance(blocks, border, remaining, conditional, gain)
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ class BorderedCovariance:
     blocks: NDArray[np.float64]  #: (k, s, s)
     border: NDArray[np.float64]  #: (k, s, q)
     #: (q, q); for the part between two different blocks, see `conditional` and `gain`
-    rest: NDArray[np.float64]
+    remaining: NDArray[np.float64]
     #: (k, s, s) B^-1: covariances of the blocks with the remaining unknowns fixed
     conditional: NDArray[np.float64]
     #: (k, s, q) B^-1 C. The inverse between blocks i and j is (i = j) B^-1 - border[i] gain[j]^T
@@ -171,7 +173,7 @@ class Elimination(ABC):
 
     @abstractmethod
     def to_unknowns(
-        self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
+        self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
     ) -> UnknownVector:
         """Return eliminated (k, s, ...) and remaining (q, ...) unknowns by kind."""
 
@@ -185,12 +187,12 @@ class Elimination(ABC):
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Return covariances by kind of unknown."""
 
-    def _globals_of(self, x_rest: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self.network.layout.expand_globals(x_rest[self.layout.globals])
+    def _globals_of(self, x_remaining: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.network.layout.expand_globals(x_remaining[self.layout.globals])
 
-    def _rest_matrix(
+    def _remaining_matrix(
         self,
-        own: NDArray[np.float64],
+        remaining_blocks: NDArray[np.float64],
         own_globals: NDArray[np.float64],
         equations: NormalEquations,
     ) -> NDArray[np.float64]:
@@ -200,32 +202,34 @@ class Elimination(ABC):
         border = self.layout.globals
         free = self.network.layout.free
         out = np.zeros((self.layout.size, self.layout.size))
-        out[rows[:, :, None], rows[:, None, :]] = own
+        out[rows[:, :, None], rows[:, None, :]] = remaining_blocks
         out[blocks, border] = own_globals.reshape(rows.size, -1)[:, free]
         out[border, blocks] = out[blocks, border].T
         out[border, border] = equations.gg[np.ix_(free, free)]
         return out
 
-    def _fix_gauge(self, rest: NDArray[np.float64], directions: NDArray[np.float64]) -> None:
+    def _fix_gauge(self, remaining: NDArray[np.float64], directions: NDArray[np.float64]) -> None:
         """Fix the undetermined directions (c, s, 7) of the remaining blocks in their matrix."""
         blocks = self.layout.blocks
         directions = directions.reshape(blocks.stop, -1)
-        factor = stabilising_factor(directions, np.diagonal(rest)[blocks])
-        rest[blocks, blocks] += factor @ factor.T
+        factor = stabilising_factor(directions, np.diagonal(remaining)[blocks])
+        remaining[blocks, blocks] += factor @ factor.T
 
-    def _split_rest(
+    def _split_remaining(
         self, covariance: BorderedCovariance
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Split covariances of the remaining unknowns: (c, s, s), gg (G, G), mixed (c, s, G)."""
-        rest = covariance.rest
+        remaining = covariance.remaining
         rows = self.layout.block_rows
         free = self.network.layout.free
         size = self.network.layout.n_globals
         gg = np.zeros((size, size))
-        gg[np.ix_(free, free)] = rest[self.layout.globals, self.layout.globals]
+        gg[np.ix_(free, free)] = remaining[self.layout.globals, self.layout.globals]
         mixed = np.zeros((*rows.shape, size))
-        mixed[:, :, free] = rest[self.layout.blocks, self.layout.globals].reshape(*rows.shape, -1)
-        return rest[rows[:, :, None], rows[:, None, :]], gg, mixed
+        mixed[:, :, free] = remaining[self.layout.blocks, self.layout.globals].reshape(
+            *rows.shape, -1
+        )
+        return remaining[rows[:, :, None], rows[:, None, :]], gg, mixed
 
     def _split_border(
         self, border: NDArray[np.float64]
@@ -258,15 +262,15 @@ class EliminatePoints(Elimination):
         by_exposure = border[:, :, self.layout.blocks].reshape(n, POINT_SIZE, m, EXTERIOR_SIZE)
         by_exposure[network.point, :, network.exposure, :] = equations.pe
         border[:, :, self.layout.globals] = equations.pg[:, :, free]
-        rest = self._rest_matrix(equations.ee, equations.eg, equations)
+        remaining = self._remaining_matrix(equations.ee, equations.eg, equations)
         rows = self.layout.block_rows
         a, b = equations.coupled_pairs.T
-        rest[rows[a][:, :, None], rows[b][:, None, :]] = equations.coupled
-        rest[rows[b][:, :, None], rows[a][:, None, :]] = equations.coupled.transpose(0, 2, 1)
+        remaining[rows[a][:, :, None], rows[b][:, None, :]] = equations.coupled
+        remaining[rows[b][:, :, None], rows[a][:, None, :]] = equations.coupled.transpose(0, 2, 1)
         if equations.gauge is not None:
-            self._fix_gauge(rest, equations.gauge.exteriors)
+            self._fix_gauge(remaining, equations.gauge.exteriors)
         right = self.right_sides(UnknownVector(equations.e, equations.p, equations.g))
-        return BorderedSystem(equations.pp, border, rest, *right)
+        return BorderedSystem(equations.pp, border, remaining, *right)
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return right sides of points (n, 3), and of exposures and free globals (q,)."""
@@ -274,11 +278,13 @@ class EliminatePoints(Elimination):
         return right.points, np.concatenate([right.exteriors.ravel(), right.globals[free]])
 
     def to_unknowns(
-        self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
+        self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
     ) -> UnknownVector:
         """Return object points (n, 3, ...) and remaining unknowns (q, ...) by kind."""
-        exteriors = x_rest[self.layout.blocks].reshape(-1, EXTERIOR_SIZE, *x_rest.shape[1:])
-        return UnknownVector(exteriors, x_blocks, self._globals_of(x_rest))
+        exteriors = x_remaining[self.layout.blocks].reshape(
+            -1, EXTERIOR_SIZE, *x_remaining.shape[1:]
+        )
+        return UnknownVector(exteriors, x_blocks, self._globals_of(x_remaining))
 
     def right_side_of_points(
         self, values: NDArray[np.float64]
@@ -289,7 +295,7 @@ class EliminatePoints(Elimination):
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Return covariances of points from the blocks, of exposures from the remaining part."""
         rows = self.layout.block_rows
-        ee, gg, eg = self._split_rest(covariance)
+        ee, gg, eg = self._split_remaining(covariance)
         pairs, pg = self._split_border(covariance.border)
 
         def points_between(p: NDArray[np.int64], q: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -304,7 +310,7 @@ class EliminatePoints(Elimination):
             eg=eg,
             pg=pg,
             pe=lambda e, p: pairs[p, :, e, :],
-            between=lambda e, f: covariance.rest[rows[e][:, :, None], rows[f][:, None, :]],
+            between=lambda e, f: covariance.remaining[rows[e][:, :, None], rows[f][:, None, :]],
             points_between=points_between,
         )
 
@@ -333,12 +339,12 @@ class EliminateExposures(Elimination):
 
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
         """Return blocks of cells, bordered by object points and free global unknowns."""
-        rest = self._rest_matrix(equations.pp, equations.pg, equations)
+        remaining = self._remaining_matrix(equations.pp, equations.pg, equations)
         if equations.gauge is not None:
-            self._fix_gauge(rest, equations.gauge.points)
+            self._fix_gauge(remaining, equations.gauge.points)
         right = self.right_sides(UnknownVector(equations.e, equations.p, equations.g))
         return BorderedSystem(
-            self._cell_blocks(equations), self._cell_border(equations), rest, *right
+            self._cell_blocks(equations), self._cell_border(equations), remaining, *right
         )
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -346,8 +352,8 @@ class EliminateExposures(Elimination):
         cell_right = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
         cell_right[self.cell, self.place] = right.exteriors
         free = self.network.layout.free
-        rest = np.concatenate([right.points.ravel(), right.globals[free]])
-        return cell_right.reshape(self.n_cells, -1), rest
+        remaining = np.concatenate([right.points.ravel(), right.globals[free]])
+        return cell_right.reshape(self.n_cells, -1), remaining
 
     def _cell_blocks(self, equations: NormalEquations) -> NDArray[np.float64]:
         """Return blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
@@ -378,24 +384,24 @@ class EliminateExposures(Elimination):
         return border.reshape(self.n_cells, EXTERIOR_SIZE * self.n_places, -1)
 
     def to_unknowns(
-        self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
+        self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
     ) -> UnknownVector:
         """Return cells (k, s, ...) and remaining unknowns (q, ...) by kind."""
-        points = x_rest[self.layout.blocks].reshape(-1, POINT_SIZE, *x_rest.shape[1:])
-        return UnknownVector(self._of_exposures(x_blocks), points, self._globals_of(x_rest))
+        points = x_remaining[self.layout.blocks].reshape(-1, POINT_SIZE, *x_remaining.shape[1:])
+        return UnknownVector(self._of_exposures(x_blocks), points, self._globals_of(x_remaining))
 
     def right_side_of_points(
         self, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return zeros for the cells, and the values in the rows of the object points."""
         columns = values.shape[2]
-        rest = np.zeros((self.layout.size, columns))
-        rest[self.layout.blocks] = values.reshape(-1, columns)
-        return np.zeros((self.n_cells, EXTERIOR_SIZE * self.n_places, columns)), rest
+        remaining = np.zeros((self.layout.size, columns))
+        remaining[self.layout.blocks] = values.reshape(-1, columns)
+        return np.zeros((self.n_cells, EXTERIOR_SIZE * self.n_places, columns)), remaining
 
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Return covariances of exposures from the cells, of points from the remaining part."""
-        pp, gg, pg = self._split_rest(covariance)
+        pp, gg, pg = self._split_remaining(covariance)
         border = self._of_exposures(covariance.border)
         pairs, eg = self._split_border(border)
         cell = self.cell
@@ -419,7 +425,9 @@ class EliminateExposures(Elimination):
             pg=pg,
             pe=lambda e, p: pairs[e, :, p, :].transpose(0, 2, 1),
             between=between,
-            points_between=lambda p, q: covariance.rest[rows[p][:, :, None], rows[q][:, None, :]],
+            points_between=lambda p, q: covariance.remaining[
+                rows[p][:, :, None], rows[q][:, None, :]
+            ],
         )
 
     def _of_exposures(self, values: NDArray[np.float64]) -> NDArray[np.float64]:

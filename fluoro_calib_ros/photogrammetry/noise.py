@@ -161,7 +161,7 @@ class Noise:
 
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
-            raise ValueError(f'loss is one of {", ".join(LOSSES)}, not {self.loss!r}')
+            raise ValueError(f'loss must be one of {", ".join(LOSSES)}, not {self.loss!r}')
         if self.loss != 'student_t':
             object.__setattr__(self, 'nu', np.inf)
             object.__setattr__(self, 'gross', 0.0)

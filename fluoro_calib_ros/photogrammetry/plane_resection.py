@@ -64,7 +64,7 @@ def plane_of(xyz: NDArray[np.float64]) -> Plane:
     centre = xyz.mean(axis=0)
     _, extent, axes = np.linalg.svd(xyz - centre, full_matrices=False)
     if extent[1] <= MIN_FLATNESS * extent[0]:
-        raise DataError('all targets lie on one line or in one place')
+        raise DataError('all targets are collinear or coincide')
     axes = axes * np.array([1, 1, np.linalg.det(axes)])[:, None]
     return Plane(centre, axes)
 
@@ -108,7 +108,7 @@ def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArr
         raise DataError(f'{len(xy)} targets are too few for a resection, {MIN_TARGETS} are needed')
     spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_FLATNESS * spread[0]:
-        raise DataError('all image points lie on one line or in one place')
+        raise DataError('all image points are collinear or coincide')
     rng = np.random.default_rng(0)
     samples = np.argsort(rng.random((SAMPLES, len(xy))), axis=1)[:, :SAMPLE_SIZE]
     candidates = homography(xy[samples], uv[samples])
@@ -150,7 +150,7 @@ def principal_distance_of_planes(
 
 
 def poses_of_homography(
-    found: NDArray[np.float64], plane: Plane, interior: NDArray[np.float64]
+    homography: NDArray[np.float64], plane: Plane, interior: NDArray[np.float64]
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Return rotation (3, 3) and position (3,) [mm] by a homography, and the mirrored pose.
 
@@ -158,7 +158,7 @@ def poses_of_homography(
     centre of the targets.
     """
     xp, yp, c = interior
-    m = np.linalg.solve(np.array([[c, 0, xp], [0, c, yp], [0, 0, 1.0]]), found)
+    m = np.linalg.solve(np.array([[c, 0, xp], [0, c, yp], [0, 0, 1.0]]), homography)
     m = m / np.sqrt(np.linalg.norm(m[:, 0]) * np.linalg.norm(m[:, 1]))
     if m[2, 2] < 0:  # the centre of the targets is in front of the source
         m = -m

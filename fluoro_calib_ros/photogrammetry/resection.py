@@ -189,14 +189,12 @@ def robust_dlt(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.
         )
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if not extent[0] > MIN_EXTENT_MM:
-        raise DataError('all targets lie in one place')
+        raise DataError('all targets coincide')
     if extent[2] < MIN_FLATNESS * extent[0]:
-        raise DataError(
-            'all targets lie in one plane, from which the principal distance cannot be found'
-        )
+        raise DataError('all targets are coplanar: the principal distance is undetermined')
     spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_FLATNESS * spread[0]:
-        raise DataError('all image points lie on one line or in one place')
+        raise DataError('all image points are collinear or coincide')
     rng = np.random.default_rng(0)
     samples = np.argpartition(rng.random((SAMPLES, len(xyz))), SAMPLE_SIZE)[:, :SAMPLE_SIZE]
     candidates = direct_linear_transformation(

@@ -125,8 +125,8 @@ class RigOrientation:
         count = len(names)
         if not names or len(set(names)) < count:
             raise DataError(
-                f'rig orientation: the fluoroscopes are {", ".join(names) or "none"}, '
-                'but each must have a name of its own'
+                f'rig orientation: the fluoroscopes are {", ".join(names) or "none"}, but each '
+                'needs a unique name'
             )
         for label, values in (('calibrations', ids), ('optical frames', frames)):
             if len(values) != count:
@@ -135,7 +135,8 @@ class RigOrientation:
                 )
         if self.source not in SOURCES:
             raise DataError(
-                f'rig orientation: its source is one of {", ".join(SOURCES)}, not {self.source!r}'
+                f'rig orientation: its source must be one of {", ".join(SOURCES)}, not '
+                f'{self.source!r}'
             )
         if not str(self.frame_id):
             raise DataError('rig orientation: the rig frame has no name')

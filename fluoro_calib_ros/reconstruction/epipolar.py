@@ -83,8 +83,8 @@ class EpipolarGeometry:
         size = np.max(np.linalg.norm(orientation.position_mm[rows], axis=1))
         if np.linalg.norm(position_a - position_b) <= MIN_BASE * size:
             raise DataError(
-                f'fluoroscopes {a} and {b} have their sources in one place, '
-                'so they have no epipolar geometry'
+                f'fluoroscopes {a} and {b} have coincident sources, so they have no epipolar '
+                'geometry'
             )
         self.fluoroscopes = (a, b)
         self._interior = orientation.interior[rows]
@@ -185,7 +185,7 @@ def _essential_jacobian(
 
 MIN_POINTS = 20  # minimum number of points in two views for judging a recording
 MAX_REJECTED = 0.5  # maximum share of rejected points in two views
-CORRECTED = Finding(Kind.CORRECTED_ALREADY, 'the image points are corrected already')
+CORRECTED = Finding(Kind.CORRECTED_ALREADY, 'the image points are already corrected')
 MAX_TRIED = 10  # maximum number of exposures to try
 UNKNOWN = Finding(
     Kind.RAYS_DO_NOT_MEET,
@@ -229,15 +229,15 @@ class RecentMisses:
         return missing_rays(rejected / total, UNKNOWN)
 
 
-def missing_rays(share: float, why: Finding) -> Finding:
+def missing_rays(share: float, reason: Finding) -> Finding:
     """Return the finding that a share of the rays miss each other, with the cause."""
-    cause = f'{100 * share:.0f} % of the rays miss each other: {why.cause}'
-    return replace(why, cause=cause, numbers={**why.numbers, 'share': share})
+    cause = f'{100 * share:.0f} % of the rays miss each other: {reason.cause}'
+    return replace(reason, cause=cause, numbers={**reason.numbers, 'share': share})
 
 
-def share_rejected(found: Sequence[ReconstructedFrame]) -> tuple[float, int]:
+def share_rejected(reconstructed: Sequence[ReconstructedFrame]) -> tuple[float, int]:
     """Return the share of rejected points, and the number of points in two views."""
-    status = np.concatenate([frame.points.status for frame in found] or [np.empty(0, int)])
+    status = np.concatenate([frame.points.status for frame in reconstructed] or [np.empty(0, int)])
     rejected, total, _ = _counts(status)
     return rejected / max(total, 1), total
 
@@ -250,21 +250,21 @@ def _counts(status: NDArray[np.integer]) -> tuple[int, int, int]:
 
 
 def mismatch(
-    found: Sequence[ReconstructedFrame],
+    reconstruction: Sequence[ReconstructedFrame],
     frames: Frames,
     calibrations: Calibrations,
     intersector: Intersector,
     pairing: RecordedPairing,
 ) -> Finding | None:
     """Return why a reconstruction is implausible, or None if nothing is wrong with it."""
-    share, total = share_rejected(found)
-    seen = sum(len(frame.target_id) for frame in found)
+    share, total = share_rejected(reconstruction)
+    seen = sum(len(frame.target_id) for frame in reconstruction)
     if not total and seen >= MIN_POINTS:
         return UNMATCHED
     if total < MIN_POINTS or share <= MAX_REJECTED:
         return None
     names = intersector.orientation.fluoroscopes
-    for cause, changed in _trials(frames, names, _largest(found)):
+    for cause, changed in _trials(frames, names, _largest(reconstruction)):
         reconstructed, _ = reconstruct_recording(changed, calibrations, intersector, pairing)
         rejected, count = share_rejected(reconstructed)
         if count >= MIN_POINTS and rejected < BETTER * share:
@@ -273,7 +273,7 @@ def mismatch(
 
 
 def cause_of_misses(
-    found: Sequence[ReconstructedFrame],
+    reconstruction: Sequence[ReconstructedFrame],
     frames: Frames,
     calibrations: Calibrations,
     intersector: Intersector,
@@ -284,8 +284,8 @@ def cause_of_misses(
     The trials are those of `mismatch`, and image points that are already corrected.
     """
     names = intersector.orientation.fluoroscopes
-    numbers = _largest(found)
-    limit = CLOSER * _miss([frame for frame in found if frame.number in numbers])
+    numbers = _largest(reconstruction)
+    limit = CLOSER * _miss([frame for frame in reconstruction if frame.number in numbers])
     uncorrected = {
         name: replace(calibrations[name], model=no_correction(), angle_field=None)
         for name in names
@@ -301,15 +301,15 @@ def cause_of_misses(
     return trials[best][0] if misses[best] < limit else None
 
 
-def _largest(found: Sequence[ReconstructedFrame]) -> set[int]:
+def _largest(reconstructed: Sequence[ReconstructedFrame]) -> set[int]:
     """Return the numbers of the frames with the most targets, for trials of causes."""
-    largest = sorted(found, key=lambda frame: -len(frame.target_id))[:MAX_TRIED]
+    largest = sorted(reconstructed, key=lambda frame: -len(frame.target_id))[:MAX_TRIED]
     return {frame.number for frame in largest}
 
 
-def _miss(found: Sequence[ReconstructedFrame]) -> float:
+def _miss(reconstructed: Sequence[ReconstructedFrame]) -> float:
     """Return the median miss of the rays over its standard deviation; infinite for few rays."""
-    points = [frame.points for frame in found]
+    points = [frame.points for frame in reconstructed]
     size = np.concatenate([p.standardised[p.status != SINGLE_VIEW] for p in points] or [[]])
     if len(size) < MIN_POINTS:
         return np.inf

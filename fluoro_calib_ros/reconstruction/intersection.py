@@ -392,7 +392,7 @@ def _without_points(solution: _Solution, wrong: NDArray[np.bool_]) -> _Solution:
 
 
 def _expanded(
-    found: IntersectedPoints, enough: NDArray[np.bool_], rays: NDArray[np.int64]
+    intersected: IntersectedPoints, enough: NDArray[np.bool_], rays: NDArray[np.int64]
 ) -> IntersectedPoints:
     """Return the points of all n targets, given those that enough (n,) fluoroscopes see."""
     n = len(enough)
@@ -407,7 +407,7 @@ def _expanded(
         dropped_view=np.full(n, -1),
     )
     for field in fields(IntersectedPoints):
-        getattr(out, field.name)[enough] = getattr(found, field.name)
+        getattr(out, field.name)[enough] = getattr(intersected, field.name)
     return out
 
 

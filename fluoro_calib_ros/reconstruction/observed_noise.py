@@ -94,8 +94,8 @@ def _finding(factor: float, calibrations: Sequence[FluoroscopeCalibration]) -> F
     stated = float(np.mean([calibration.image_sd for calibration in calibrations]))
     return Finding(
         Kind.NOISE_OBSERVED,
-        f'the image points have no sigma, and their rays show a noise of {factor * stated:.2g} px '
-        f'where the calibration has {stated:.2g} px; that of the rays is taken',
+        f'the image points have no sigma, and their rays show a noise of {factor * stated:.2g} '
+        f'px where the calibration has {stated:.2g} px; the noise of the rays is used',
         advice='give their sigma, if it is known',
         severity=Severity.NOTE,
         numbers={'noise_px': factor * stated, 'calibration_px': stated},
@@ -113,9 +113,11 @@ def _factor(pairs: Sequence[tuple[_Residuals, _Residuals]]) -> float:
     return factor if factor > chance else 1.0
 
 
-def _explains(factor: float, found: Sequence[_Residuals]) -> bool:
+def _explains(factor: float, residuals: Sequence[_Residuals]) -> bool:
     """Return whether residuals agree with noise larger by a factor than the calibration's."""
-    size = [np.abs(part.value) / np.hypot(factor * part.noise_sd, part.other_sd) for part in found]
+    size = [
+        np.abs(part.value) / np.hypot(factor * part.noise_sd, part.other_sd) for part in residuals
+    ]
     return bool(np.median(np.concatenate(size)) <= MAX_UNEXPLAINED * NORMAL_MEDIAN)
 
 

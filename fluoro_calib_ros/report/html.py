@@ -43,7 +43,7 @@ TEMPLATES = Path(__file__).parent / 'templates'
 VERDICTS = {
     'pass': 'This calibration can be used.',
     'fail': 'Do not use this calibration.',
-    'cannot tell': 'It cannot be told whether this calibration can be used.',
+    'cannot tell': 'The checks cannot decide whether this calibration can be used.',
     None: 'This calibration has not been validated.',
 }
 MAX_ROWS = 40  # maximum rows in the lists of outliers and correlations
@@ -74,17 +74,17 @@ class ReportInput:
     radiographs: Mapping[str, Mapping[int, bytes]] = field(default_factory=dict)
 
 
-def report_html(given: ReportInput, progress: Callable[[int, int], object] | None = None) -> str:
+def report_html(report: ReportInput, progress: Callable[[int, int], object] | None = None) -> str:
     """Return the report as HTML with embedded figures and no external references.
 
     progress is called with the number of figures drawn so far and the total number.
     """
-    residuals = {name: _residuals(given, name) for name in given.calibrations}
+    residuals = {name: _residuals(report, name) for name in report.calibrations}
     with style.context(['default', STYLE]):
         scale = common_scale(
-            (c.model, c.image_size) for c in given.calibrations.values() if c.model.kind != 'none'
+            (c.model, c.image_size) for c in report.calibrations.values() if c.model.kind != 'none'
         )
-        figures = {name: _figures(given, name, residuals[name], scale) for name in residuals}
+        figures = {name: _figures(report, name, residuals[name], scale) for name in residuals}
         pictures: dict[str, list[tuple[str, str]]] = {name: [] for name in residuals}
         drawn = [
             (name, *titled_figure)
@@ -95,23 +95,23 @@ def report_html(given: ReportInput, progress: Callable[[int, int], object] | Non
             if progress is not None:
                 progress(number, len(drawn))
             pictures[name].append((title, svg_text(figure)))
-        beads = _bead_picture(given)
+        beads = _bead_picture(report)
     return page(
         'report.html',
-        given=given,
-        verdict=_verdict(given),
-        fluoroscopes={name: _fluoroscope(given, name, residuals[name]) for name in residuals},
+        given=report,
+        verdict=_verdict(report),
+        fluoroscopes={name: _fluoroscope(report, name, residuals[name]) for name in residuals},
         pictures=pictures,
         beads=beads,
-        rig=drawing(given.result, given.calibrations, given.orientation),
-        beams=beams(given.orientation) if given.orientation else [],
-        outliers=_outliers(given, residuals),
-        arrows=_arrows(given, residuals),
-        radiographs=_radiographs(given, residuals),
-        space=given.space,
-        about=given.settings.get('about') or {},
-        adjustments=given.result.get('adjustments', []),
-        correlations=given.result.get('correlations', [])[:MAX_ROWS],
+        rig=drawing(report.result, report.calibrations, report.orientation),
+        beams=beams(report.orientation) if report.orientation else [],
+        outliers=_outliers(report, residuals),
+        arrows=_arrows(report, residuals),
+        radiographs=_radiographs(report, residuals),
+        space=report.space,
+        about=report.settings.get('about') or {},
+        adjustments=report.result.get('adjustments', []),
+        correlations=report.result.get('correlations', [])[:MAX_ROWS],
     )
 
 
@@ -127,13 +127,13 @@ def page(template: str, **values: Any) -> str:
     return environment.get_template(template).render(**values, versions=versions(), text=_text)
 
 
-def _verdict(given: ReportInput) -> dict[str, Any]:
+def _verdict(report: ReportInput) -> dict[str, Any]:
     """Return verdict, its sentence, findings with advice, and checks."""
-    verdict = None if given.validation is None else given.validation.get('verdict')
-    findings = sentences(filter(None, [given.edited]))
-    findings += given.validation.get('findings', []) if given.validation else []
-    findings += [f'This cannot be right: {doubt}' for doubt in given.result.get('doubts', [])]
-    findings += sentences(filter(None, [given.rig_note]))
+    verdict = None if report.validation is None else report.validation.get('verdict')
+    findings = sentences(filter(None, [report.edited]))
+    findings += report.validation.get('findings', []) if report.validation else []
+    findings += [f'Implausible: {doubt}' for doubt in report.result.get('doubts', [])]
+    findings += sentences(filter(None, [report.rig_note]))
     if verdict is None:
         findings.insert(
             0, 'Run fluoro-calib validate on this folder, then write the report again.'
@@ -146,32 +146,32 @@ def _verdict(given: ReportInput) -> dict[str, Any]:
         'sentence': VERDICTS.get(verdict, VERDICTS['cannot tell']),
         'findings': findings,
         'checks': [
-            {'sentence': '', 'advice': '', **check, 'mm': _check_mm(given, check)}
-            for check in (given.validation.get('checks', []) if given.validation else [])
+            {'sentence': '', 'advice': '', **check, 'mm': _check_mm(report, check)}
+            for check in (report.validation.get('checks', []) if report.validation else [])
         ],
     }
 
 
-def _check_mm(given: ReportInput, check: Mapping[str, Any]) -> float | None:
+def _check_mm(report: ReportInput, check: Mapping[str, Any]) -> float | None:
     """Return the value of a check in mm at the phantom; None if it is not a length."""
     if check.get('value') is None:
         return None
     if check.get('unit') == 'mm':
         return float(check['value'])
     name = str(check.get('fluoroscope'))
-    if check.get('unit') != 'px' or name not in given.calibrations:
+    if check.get('unit') != 'px' or name not in report.calibrations:
         return None
-    return float(check['value']) * _mm_per_px(given, name)
+    return float(check['value']) * _mm_per_px(report, name)
 
 
-def _mm_per_px(given: ReportInput, name: str) -> float:
+def _mm_per_px(report: ReportInput, name: str) -> float:
     """Return the size of a pixel at the median distance of the phantom [mm]."""
-    distance = phantom_distance(given.result['fluoroscopes'][name]['exposures'])
-    return distance / float(given.calibrations[name].interior[2])
+    distance = phantom_distance(report.result['fluoroscopes'][name]['exposures'])
+    return distance / float(report.calibrations[name].interior[2])
 
 
-def _residuals(given: ReportInput, name: str) -> Residuals:
-    exposures = given.result['fluoroscopes'][name]['exposures']
+def _residuals(report: ReportInput, name: str) -> Residuals:
+    exposures = report.result['fluoroscopes'][name]['exposures']
     poses = {
         int(entry['exposure']): (
             matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float)),
@@ -179,20 +179,20 @@ def _residuals(given: ReportInput, name: str) -> Residuals:
         )
         for entry in exposures
     }
-    points = {int(t['target_id']): np.array(t['xyz_mm'], float) for t in given.result['targets']}
+    points = {int(t['target_id']): np.array(t['xyz_mm'], float) for t in report.result['targets']}
     outliers = {
         (int(o['exposure']), int(o['target_id']))
-        for o in _outlying_points(given)
+        for o in _outlying_points(report)
         if o['fluoroscope'] == name
     }
-    return residuals_of(given.calibrations[name], given.frames[name], poses, points, outliers)
+    return residuals_of(report.calibrations[name], report.frames[name], poses, points, outliers)
 
 
-def _outlying_points(given: ReportInput) -> list[Mapping[str, Any]]:
-    return list((given.result.get('outliers') or {}).get('image_points', []))
+def _outlying_points(report: ReportInput) -> list[Mapping[str, Any]]:
+    return list((report.result.get('outliers') or {}).get('image_points', []))
 
 
-def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str, Any]:
+def _outliers(report: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str, Any]:
     """Return the largest outliers, with names and residuals [px], and their number."""
     length = {
         (name, exposure, target): px
@@ -203,9 +203,9 @@ def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[st
             np.hypot(*view_residuals.after.T).tolist(),
         )
     }
-    points = sorted(_outlying_points(given), key=lambda o: -float(o['value']))
-    targets = given.names.target_names()
-    exposures = given.names.exposure_names()
+    points = sorted(_outlying_points(report), key=lambda o: -float(o['value']))
+    targets = report.names.target_names()
+    exposures = report.names.exposure_names()
     rows = [
         {
             **o,
@@ -218,12 +218,12 @@ def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[st
     return {'count': len(points), 'of': sum(len(r.uv) for r in residuals.values()), 'rows': rows}
 
 
-def residual_rows(given: ReportInput) -> dict[str, Any]:
+def residual_rows(report: ReportInput) -> dict[str, Any]:
     """Return the residuals of every exposure as in the report, see `_arrows`."""
-    return _arrows(given, {name: _residuals(given, name) for name in given.calibrations})
+    return _arrows(report, {name: _residuals(report, name) for name in report.calibrations})
 
 
-def _arrows(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str, Any]:
+def _arrows(report: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str, Any]:
     """Return the residuals of every exposure for interactive display; {} if there are too many.
 
     The rows u, v, du, dv and inlier flag are grouped by fluoroscope and exposure number.
@@ -239,12 +239,12 @@ def _arrows(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str,
             int(number): view_rows[view_residuals.exposure == number].tolist()
             for number in np.unique(view_residuals.exposure)
         }
-        arrows[name] = {'size': list(given.calibrations[name].image_size), 'exposures': exposures}
+        arrows[name] = {'size': list(report.calibrations[name].image_size), 'exposures': exposures}
     return arrows
 
 
 def _radiographs(
-    given: ReportInput, residuals: Mapping[str, Residuals]
+    report: ReportInput, residuals: Mapping[str, Residuals]
 ) -> dict[str, dict[int, str]]:
     """Return the radiographs in base64, by fluoroscope and exposure.
 
@@ -254,30 +254,30 @@ def _radiographs(
         (-np.nan_to_num(after, nan=np.inf), name, number)
         for name, view_residuals in residuals.items()
         for number, _, _, after in view_residuals.of_exposures()
-        if number in given.radiographs.get(name, {})
+        if number in report.radiographs.get(name, {})
     )
     images: dict[str, dict[int, str]] = {}
     bytes_left = MAX_RADIOGRAPHS_BYTES
     for _, name, number in by_rms:
-        content = given.radiographs[name][number]
+        content = report.radiographs[name][number]
         if len(content) <= bytes_left:
             bytes_left -= len(content)
             images.setdefault(name, {})[number] = base64.b64encode(content).decode()
     return images
 
 
-def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[str, Any]:
+def _fluoroscope(report: ReportInput, name: str, residuals: Residuals) -> dict[str, Any]:
     """Return the numbers of a fluoroscope in the report."""
-    calibration = given.calibrations[name]
+    calibration = report.calibrations[name]
     covered = covered_cells(residuals.uv, calibration.image_size)
-    exposures = given.names.exposure_names()
+    exposures = report.names.exposure_names()
     missing = missing_sides(residuals.uv, calibration.image_size)
     sd = np.array([np.nan])
     if len(residuals.uv):
         sd = calibration.correction(residuals.uv, residuals.angle).sd
     return {
-        'label': given.names.fluoroscope_names().get(name, name),
-        'entry': given.result['fluoroscopes'][name],
+        'label': report.names.fluoroscope_names().get(name, name),
+        'entry': report.result['fluoroscopes'][name],
         'calibration': calibration,
         'model': model_text(calibration.model),
         'covered': float(covered.mean()),
@@ -287,14 +287,14 @@ def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[st
         'correlation': _correlation(calibration.interior_covariance),
         'exterior': [
             (exposures.get(int(e['exposure']), e['exposure']), e)
-            for e in given.result['fluoroscopes'][name]['exposures']
+            for e in report.result['fluoroscopes'][name]['exposures']
         ],
         'exposures': [
             (number, exposures.get(number, number), *statistics)
             for number, *statistics in residuals.of_exposures()
         ],
-        'mm_per_px': _mm_per_px(given, name),
-        'distance_mm': phantom_distance(given.result['fluoroscopes'][name]['exposures']),
+        'mm_per_px': _mm_per_px(report, name),
+        'distance_mm': phantom_distance(report.result['fluoroscopes'][name]['exposures']),
         'uncalibrated': uncalibrated_share(calibration),
     }
 
@@ -312,10 +312,10 @@ def _correlation(covariance: NDArray[np.float64]) -> list[list[float]]:
 
 
 def _figures(
-    given: ReportInput, name: str, residuals: Residuals, scale: Scale
+    report: ReportInput, name: str, residuals: Residuals, scale: Scale
 ) -> list[tuple[str, Figure]]:
     """Return titles and figures of a fluoroscope."""
-    calibration = given.calibrations[name]
+    calibration = report.calibrations[name]
     size = calibration.image_size
     figures: list[tuple[str, Figure]] = []
     if calibration.model.kind != 'none':
@@ -338,19 +338,19 @@ def svg_text(figure: Figure) -> str:
     return base64.b64encode(svg_bytes(figure)).decode()
 
 
-def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
+def _bead_picture(report: ReportInput) -> dict[str, Any] | None:
     """Return the shifts of the beads from the survey, None without beads."""
-    targets = given.result['targets']
+    targets = report.result['targets']
     ids = np.array([t['target_id'] for t in targets], dtype=np.int64)
-    row = given.phantom.index(ids) if len(ids) else np.zeros(0, dtype=int)
+    row = report.phantom.index(ids) if len(ids) else np.zeros(0, dtype=int)
     on_phantom = row >= 0
     if on_phantom.sum() < 2:
         return None
     xyz = np.array([t['xyz_mm'] for t in targets], dtype=float)[on_phantom]
-    shift = xyz - given.phantom.xyz_mm[row[on_phantom]]
-    sd = given.phantom.sd_mm[row[on_phantom]]
+    shift = xyz - report.phantom.xyz_mm[row[on_phantom]]
+    sd = report.phantom.sd_mm[row[on_phantom]]
     order = np.argsort(-np.hypot(np.hypot(*shift.T[:2]), shift.T[2]) / sd)[:10]
-    names = given.names.target_names()
+    names = report.names.target_names()
     return {
         'svg': svg_text(bead_shifts(shift, sd)),
         'rms': np.sqrt(np.mean(shift**2, axis=0)).tolist(),

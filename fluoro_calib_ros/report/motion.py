@@ -173,10 +173,10 @@ def _draw_paths(axes: Axes, xyz: NDArray[np.float64]) -> None:
 
 
 def _draw_gaps(
-    axes: Axes, when: np.ndarray, found: NDArray[np.bool_], labels: Sequence[str]
+    axes: Axes, when: np.ndarray, detected: NDArray[np.bool_], labels: Sequence[str]
 ) -> None:
     """Draw when targets (T, n) were found, one row a target, with the share of frames."""
-    for row, is_found in enumerate(found.T):
+    for row, is_found in enumerate(detected.T):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], is_found.astype(int), [0]])))
         step = float(np.median(np.diff(when))) if len(when) > 1 else 1.0
         spans = [
@@ -184,7 +184,7 @@ def _draw_gaps(
             for start, stop in zip(edges[::2], edges[1::2])
         ]
         axes.broken_barh(spans, (row - 0.4, 0.8), color=BLUE, linewidth=0)
-    shares = 100 * found.mean(axis=0)
+    shares = 100 * detected.mean(axis=0)
     rows = np.arange(len(labels))
     if len(labels) <= MAX_NAMED:
         axes.set_yticks(rows, [f'{name}: {share:.0f} %' for name, share in zip(labels, shares)])

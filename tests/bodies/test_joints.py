@@ -640,7 +640,7 @@ FEMUR = mannequin('femur_grood_suntay', 'right')
             lambda: joint_motion(
                 Joint('j', 'a', 'b', 'cardan_xyz'), poses('a', EYE), poses('b', [EYE, EYE])
             ),
-            'other exposures',
+            'different exposures',
         ),
     ],
 )

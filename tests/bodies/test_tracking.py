@@ -251,7 +251,7 @@ def test_butterworth_propagates_deviations_and_refuses_what_it_cannot_do():
     with pytest.raises(DataError, match='not between 0 and half of the rate'):
         filtered_poses(alone, 125.0)
     uneven = dataclasses.replace(alone, stamp_ns=alone.stamp_ns + (alone.number > 50) * 10**8)
-    with pytest.raises(DataError, match='not equally far apart'):
+    with pytest.raises(DataError, match='equal time intervals'):
         filtered_poses(uneven, 12.0)
 
 

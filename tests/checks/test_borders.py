@@ -114,7 +114,7 @@ def test_targets_and_their_multiples_are_told_apart_by_a_projection():
         ((np.nan, 10.0), 'a C-arm at another angle', True),
         ((10.0, 10.0), 'a C-arm at another angle', False),
         ((0.0, 6.28), 'in radians', False),
-        ((0.0, 6.29), 'not those of these exposures', False),
+        ((0.0, 6.29), 'belong to other exposures', False),
     ],
 )
 def test_what_may_be_wrong_with_angles_depends_on_their_range(degrees, what, is_asked):

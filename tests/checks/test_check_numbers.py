@@ -244,7 +244,7 @@ def test_targets_on_a_line_are_not_looked_at_for_wrong_coordinates():
 def test_names_of_fluoroscopes_may_have_capitals_but_not_differ_in_these():
     inputs.validate_names(['A', 'b', 'Ab'])
     inputs.validate_names(['A', 'A'])
-    with pytest.raises(DataError, match='fluoroscopes Ab and aB differ in capital') as told:
+    with pytest.raises(DataError, match='fluoroscopes Ab and aB differ only in case') as told:
         inputs.validate_names(['b', 'Ab', 'c', 'aB'])
     assert told.value.finding.place.fluoroscopes == ('Ab', 'aB')
 

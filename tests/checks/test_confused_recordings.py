@@ -565,7 +565,7 @@ def test_a_file_of_corrected_points_says_so(tmp_path, capsys):
     ):
         capsys.readouterr()
         assert run(*command) == 1
-        assert 'are corrected already' in capsys.readouterr().err
+        assert 'are already corrected' in capsys.readouterr().err
     # Uncorrected output can still be converted.
     assert run('convert', corrected, *with_held, '--to', 'xmalab2d', *out) == 0
 
@@ -598,7 +598,7 @@ def test_adjusted_exposures_that_contradict_the_calibrations_are_doubtful():
 @pytest.mark.parametrize(
     ('change', 'sentence', 'verdict'),
     [
-        (nudged(3.0, 0.01, 4, 5), 'orientation of the rig: not from exposure 5, in which', 'pass'),
+        (nudged(3.0, 0.01, 4, 5), 'orientation of the rig: without exposure 5, where', 'pass'),
         (rig_moved(4.0, 0.006, 4), 'was moved between exposures 4 and 5', 'fail'),
         (None, '', 'pass'),
     ],
@@ -623,7 +623,7 @@ def test_what_is_doubtful_about_the_rig_stays_with_the_result(
     monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     assert run('validate', out) == status
     shown = ' '.join(capsys.readouterr().out.replace('\n  ', ' ').split())
-    assert sentence in shown and 'takes on trust' in shown
+    assert sentence in shown and 'assumes that frames' in shown
     validation = json.loads((out / 'validation.json').read_text())
     assert validation['verdict'] == verdict
     for _ in range(2):
@@ -656,4 +656,4 @@ def test_the_commands_say_what_is_wrong(tmp_path, capsys):
     assert run('orient', source, *held, *phantom, *arguments) == 0
     said = capsys.readouterr().err
     # The phantom of exposure 1 defines another frame, but the fluoroscopes have not moved.
-    assert 'stand otherwise' not in said and 'doubtful' not in said
+    assert 'differs from the previous' not in said and 'doubtful' not in said

@@ -439,11 +439,11 @@ def test_arrays_of_different_lengths_are_refused():
     'wrong, sentence',
     [
         ({'cells': 3}, 'cells must be an even number'),
-        ({'cells': 40}, 'cells is between 2 and 16'),
-        ({'error_interval_h': 0.0}, 'error_interval_h is between 0.001 and 1e\\+09'),
-        ({'step_px': float('nan')}, 'step_px is between 0.001 and 100'),
+        ({'cells': 40}, 'cells must be between 2 and 16'),
+        ({'error_interval_h': 0.0}, 'error_interval_h must be between 0.001 and 1e\\+09'),
+        ({'step_px': float('nan')}, 'step_px must be between 0.001 and 100'),
         ({'warn_interval_h': 2000.0}, 'warn_interval_h must not exceed error_interval_h'),
-        ({'clip': 0.5}, 'clip is between 1 and 10'),
+        ({'clip': 0.5}, 'clip must be between 1 and 10'),
         ({'learn_s': 1.0, 'block_s': 0.5}, 'learn_s must be at least 4 blocks'),
     ],
 )

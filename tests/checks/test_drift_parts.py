@@ -34,7 +34,7 @@ from fluoro_calib_ros.checks.pair_watch import PairWatch, SystematicErrorField
 from fluoro_calib_ros.checks.rig_change import Addition, RigChange
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Finding, Kind
-from fluoro_calib_ros.healing.sizes import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX, Told
+from fluoro_calib_ros.healing.sizes import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX, ChangeStatistics
 from fluoro_calib_ros.reconstruction.reconstruct import IntersectedViews, MatchedViews
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -59,7 +59,7 @@ def test_moment_and_evidence_are_those_of_a_normal_prior():
     p = np.linalg.inv(n + np.linalg.inv(d))
     expected = np.zeros((5, 5))
     expected[np.ix_(rows, rows)] = np.outer(p @ g, p @ g) + p
-    told = Told(normal, right)
+    told = ChangeStatistics(normal, right)
     log_z = told.evidence(sd)
     np.testing.assert_allclose(told.moments(sd), expected, atol=1e-12)
     determinant = np.linalg.det(np.eye(3) + n @ d)
@@ -711,7 +711,7 @@ def test_verdict_on_a_recording_is_that_of_its_worst_state(monkeypatch):
     assert found.found_ns == 102 * 10**9  # time at which the level was first reached
     assert found.began_ns == 103 * 10**9 - 3 * 10**9
     assert found.widening is wide[1] and found.watched_s == 20.0
-    assert 'found 2.0 s after the beginning; it was gone at the end' in found.finding.cause
+    assert 'alarm 2.0 s after the start; no longer detected at the end' in found.finding.cause
     assert found.finding.advice == 'the calibration no longer holds'
     found = recorded([calm, warn], monkeypatch=monkeypatch)
     assert found.level == 'warn' and found.found_ns == 101 * 10**9

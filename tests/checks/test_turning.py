@@ -46,7 +46,7 @@ def test_calibration_with_unknown_angles_fails_and_is_told_to_give_them(monkeypa
     ('change', 'cause'),
     [
         (np.deg2rad, 'angles of the C-arm that are in radians'),
-        (lambda angles: np.roll(angles, 1), 'angles of the C-arm that are not those of these'),
+        (lambda angles: np.roll(angles, 1), 'angles of the C-arm that belong to other'),
     ],
 )
 def test_wrong_angles_fail_with_their_cause(change, cause, monkeypatch):

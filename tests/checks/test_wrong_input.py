@@ -670,7 +670,7 @@ def test_the_command_refuses_wrong_input_and_writes_it_only_when_forced(tmp_path
     assert said.count('\n') == 1
     assert not (tmp_path / 'result').exists()
     assert run(*arguments, '--force') == 3
-    assert 'this cannot be right: fluoroscope a: ' in capsys.readouterr().err
+    assert 'implausible: fluoroscope a: ' in capsys.readouterr().err
     assert '"doubts": [\n    "fluoroscope a: ' in (tmp_path / 'result' / 'result.json').read_text()
 
 

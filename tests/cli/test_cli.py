@@ -539,7 +539,7 @@ def test_points_off_the_image_are_refused_with_their_row(rig, tmp_path, capsys):
     sentence = said(
         capsys, calibrate(rig, tmp_path / 'x', '--image-size', '512x512', source='calibration.csv')
     )
-    assert re.search(r'calibration.csv, row \d+: the point .* is off the image', sentence)
+    assert re.search(r'calibration.csv, row \d+: the point .* is outside the image', sentence)
 
 
 def test_unknown_fluoroscope_is_reported(rig, tmp_path, capsys):

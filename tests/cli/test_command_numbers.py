@@ -493,14 +493,14 @@ def test_healed_rig_is_told_by_fluoroscope_with_what_it_is_worth():
     [
         ((), False, 'no change of the rig is evident'),
         ((Cause.LOOSE,), False, 'no change of the rig is evident'),
-        ((Cause.LOOSE, Cause.DISTORTION), False, 'it stays'),
+        ((Cause.LOOSE, Cause.DISTORTION), False, 'the calibration stays'),
         ((), True, 'the rig changed during the recording'),
     ],
 )
 def test_rig_that_is_not_healed_stays_as_it_was_calibrated(causes, meanwhile, first):
     lines = heal._lines(Fake(out='healed'), healing(causes=causes, meanwhile=meanwhile))
     assert lines[0].startswith(first)
-    assert lines[meanwhile].endswith('it stays as it was calibrated, nothing is written')
+    assert lines[meanwhile].endswith('the calibration stays as it was, nothing is written')
     assert lines[meanwhile].startswith('no change') is (first.startswith('no change'))
     assert not any('healed' in line for line in lines)
 
@@ -570,7 +570,7 @@ def test_phantom_is_written_with_its_picture(tmp_path, capsys, words, full, bloc
 def test_damage_of_a_bag_is_told_between_its_times():
     second = 10**9
     for start, end, when in (
-        (None, None, 'all of the file'),
+        (None, None, 'the whole file'),
         (second, None, 'after 1970-01-01T00:00:01.000Z'),
         (None, 2 * second, 'before 1970-01-01T00:00:02.000Z'),
         (second, 2 * second, 'between 1970-01-01T00:00:01.000Z and'),

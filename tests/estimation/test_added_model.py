@@ -80,5 +80,5 @@ def test_options_declare_an_added_model():
 
 
 def test_model_that_is_not_registered_is_refused():
-    with pytest.raises(ValueError, match=f"model is one of auto, .*, not '{NAME}'"):
+    with pytest.raises(ValueError, match=f"model must be one of auto, .*, not '{NAME}'"):
         CalibrationOptions(NAME)

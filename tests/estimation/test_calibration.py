@@ -531,7 +531,7 @@ def shuffled_ids(frame, seed=4):
         ),
         (
             lambda f: f[:4] + [with_value(f[4], 1024.0)],
-            'fluoroscope a, frame 5: target .* is off the image',
+            'fluoroscope a, frame 5: target .* is outside the image',
         ),
         (lambda f: f[:4] + [f[2]], 'fluoroscope a: exposure 3 appears twice'),
         (

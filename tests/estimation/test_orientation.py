@@ -228,7 +228,7 @@ def test_more_precise_targets_give_a_more_precise_orientation():
     [
         (
             lambda f, c: ({'a': f['a']}, c),
-            'a rig has two fluoroscopes or more, there are frames of a only',
+            'a rig needs two fluoroscopes or more, there are frames of a only',
         ),
         (lambda f, c: (f, {'a': c['a']}), 'there is no calibration of fluoroscope b, only of a'),
         (lambda f, c: ({**f, 'b': []}, c), 'fluoroscope b: there is no frame of the phantom'),
@@ -371,8 +371,8 @@ def test_exposures_that_do_not_belong_together_are_refused():
     apart = {'a': frames['a'], 'b': [replace(f, number=f.number + 100) for f in frames['b']]}
     with pytest.raises(
         DataError,
-        match='fluoroscopes a and b: no exposures have the same number, so that their '
-        'relative orientation is not known',
+        match='fluoroscopes a and b: no exposures have the same number, so their relative '
+        'orientation is unknown',
     ):
         orientation_and_scatter(apart, rig().phantom, calibrations())[0]
 
@@ -404,7 +404,7 @@ def test_file_round_trip_is_exact(tmp_path, found):
 @pytest.mark.parametrize(
     'change, sentence',
     [
-        ({'format_version': np.array(7)}, 'layout version 7, this program knows version 1'),
+        ({'format_version': np.array(7)}, 'layout version 7, this program reads version 1'),
         (
             {'format_version': None},
             'this is not a rig orientation file, it has no array format_version',

@@ -154,7 +154,7 @@ def test_regressors_of_one_output_and_of_few_samples():
     assert few.n_neighbors_ == 50 and np.isfinite(few.predict(uv)).all()
     with pytest.raises(ValueError):
         KnnRegressor(51).fit(uv, duv).predict(uv)
-    with pytest.raises(ValueError, match='n_neighbors is at least 1, not 0'):
+    with pytest.raises(ValueError, match='n_neighbors must be at least 1, not 0'):
         LocalLinearRegressor(0).fit(uv, duv)
     alike = LocalLinearRegressor(4, None).fit(
         np.array([[0, 1], [1, 0], [0, -1], [-1.0, 0]]), duv[:4]
@@ -315,7 +315,7 @@ def test_names_of_classes_are_refused_from_files_and_messages(tmp_path):
 
 @pytest.mark.parametrize('model', [DecisionTreeRegressor, 5, None, {}])
 def test_model_that_is_no_regressor_is_refused(model):
-    with pytest.raises(ValueError, match='model is a name or a scikit-learn regressor'):
+    with pytest.raises(ValueError, match='model must be a name or a scikit-learn regressor'):
         CalibrationOptions(model)
 
 
@@ -328,7 +328,7 @@ def test_options_with_a_regressor_exclude_k():
 
 def test_lookup_cannot_be_selected():
     assert 'lookup' in MODELS
-    with pytest.raises(ValueError, match='model is one of'):
+    with pytest.raises(ValueError, match='model must be one of'):
         CalibrationOptions('lookup')
 
 

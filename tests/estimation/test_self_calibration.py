@@ -416,7 +416,7 @@ def test_estimators_are_those_of_selectable_models():
     assert estimator_of('knn').kind == 'knn' and estimator_of('none').kind == 'none'
     assert estimator_of(LinearRegression()).kind == 'lookup'
     for name in ('lookup', 'auto', 'spline'):
-        with pytest.raises(ValueError, match='correction model is one of'):
+        with pytest.raises(ValueError, match='correction model must be one of'):
             estimator_of(name)
 
 

@@ -168,11 +168,11 @@ def test_distances_equal_a_dense_adjustment_with_unknown_scale():
     'ends, length_mm, sd_mm, said',
     [
         ((4, 4), 100.0, 0.1, 'both ends are the same bead'),
-        ((4, 5), 0.0, 0.1, 'are numbers above 0'),
-        ((4, 5), np.inf, 0.1, 'are numbers above 0'),
-        ((4, 5), np.nan, 0.1, 'are numbers above 0'),
-        ((4, 5), 100.0, 0.0, 'are numbers above 0'),
-        ((4, 5), 100.0, np.inf, 'are numbers above 0'),
+        ((4, 5), 0.0, 0.1, 'must be finite and above 0'),
+        ((4, 5), np.inf, 0.1, 'must be finite and above 0'),
+        ((4, 5), np.nan, 0.1, 'must be finite and above 0'),
+        ((4, 5), 100.0, 0.0, 'must be finite and above 0'),
+        ((4, 5), 100.0, np.inf, 'must be finite and above 0'),
     ],
 )
 def test_a_distance_that_is_none_is_refused(ends, length_mm, sd_mm, said):

@@ -62,7 +62,7 @@ def test_clock_that_is_set_back_begins_anew():
 def test_position_that_is_no_angle_in_radians_is_unknown(position):
     found = track([(S, 0.1), (2 * S, position)])
     assert found.at(2 * S) is None
-    assert 'no angle between -12.57 and 12.57 rad' in found.doubt(2 * S)
+    assert 'not an angle between -12.57 and 12.57 rad' in found.doubt(2 * S)
 
 
 def test_angle_is_that_of_a_frame_to_the_last_bit():

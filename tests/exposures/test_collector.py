@@ -235,7 +235,7 @@ def test_frames_by_fluoroscope():
         'b': [1, 2],
     }
     assert list(collector.frames(['b'])) == ['b']
-    with pytest.raises(DataError, match='fluoroscope c is unknown, there are a, b'):
+    with pytest.raises(DataError, match='fluoroscope c is unknown, expected one of a, b'):
         collector.frames(['c'])
 
 

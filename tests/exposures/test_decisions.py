@@ -106,8 +106,8 @@ def test_table_is_read_with_names(tmp_path):
     ('row', 'cause'),
     [
         ('a,1,,2,maybe', "decision is 'maybe', neither 'leave out' nor a target_id"),
-        ('a,1,,,3', "decision is '3', but a whole exposure can only be left out"),
-        ('a,x,,2,3', "exposure is 'x', not a whole number"),
+        ('a,1,,,3', "decision is '3', but a whole exposure can only be excluded"),
+        ('a,x,,2,3', "exposure is 'x', not an integer"),
         ('a,5,4,2,3', 'last_exposure is 4, before exposure 5'),
         ('a,1,,99999999999,3', 'target_id is'),
     ],
@@ -194,7 +194,7 @@ def test_commands_read_decisions(tmp_path, capsys):
     given = ('--phantom', tmp_path / 'phantom.csv', '--image-size', '1024x1024', '--fast')
     given += ('--decisions', table, '--max-iterations', '2')
     assert run('calibrate', tmp_path / 'seen.csv', *given, '--out', tmp_path / 'result') == 0
-    assert '1 exposures and 0 further image points are left out' in capsys.readouterr().err
+    assert '1 exposures and 0 further image points are excluded' in capsys.readouterr().err
     with (tmp_path / 'result' / 'exposures.csv').open() as file:
         used = {int(row['exposure']) for row in csv.DictReader(file)}
     assert used == {f.number for f in exposures()['a'][:7]} - {exposures()['a'][3].number}

@@ -40,7 +40,7 @@ def test_topic_of_a_bag_that_is_no_text(tmp_path):
     with sqlite3.connect(path) as database:
         database.execute("UPDATE topics SET name = X'2F61' WHERE id = 1")
     database.close()
-    with pytest.raises(DataError, match='the name of a topic is no text'):
+    with pytest.raises(DataError, match='the name of a topic is not a text'):
         topics_of(path)
 
 
@@ -57,7 +57,7 @@ def test_rotation_matrix_of_giant_numbers(tmp_path):
 
 
 def test_phantom_in_one_place():
-    with pytest.raises(DataError, match='all targets lie in one place'):
+    with pytest.raises(DataError, match='all targets coincide'):
         robust_dlt(np.full((20, 3), 5e-324), np.random.default_rng(0).uniform(0, 1000, (20, 2)))
 
 
@@ -87,7 +87,7 @@ def test_stack_whose_second_page_is_giant(tmp_path):
 def test_format_that_does_not_tell_its_size():
     """WIDTH and HEIGHT of a PAM may be anything, yet OpenCV would decode it."""
     content = b'P7\nWIDTH 30000\nHEIGHT 30000\nDEPTH 1\nMAXVAL 255\nTUPLTYPE GRAYSCALE\nENDHDR\n'
-    with pytest.raises(DataError, match='this is no image that can be decoded'):
+    with pytest.raises(DataError, match='this is not an image that can be decoded'):
         decode(content + bytes(100))
 
 

@@ -173,7 +173,7 @@ def test_error_of_a_correction_counts_once():
 def test_healthy_rig_has_not_changed():
     scene = Scene(3)
     found = scene.diagnostician().diagnose(scene.observe(), scene.poses())
-    assert found.changes == () and found.rest > 0.95 and found.sure
+    assert found.changes == () and found.no_further_probability > 0.95 and found.sure
     assert found.noise < 1.1
 
 

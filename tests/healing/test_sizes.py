@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from fluoro_calib_ros.healing.sizes import SIZES, Told
+from fluoro_calib_ros.healing.sizes import SIZES, ChangeStatistics
 
 
 def told_of(change, design, noise, rng):
     """Information on a change (k,) from observations with derivatives design (n, k)."""
     observed = design @ change + rng.normal(0, noise, len(design))
-    return Told(design.T @ design / noise**2, design.T @ observed / noise**2), observed
+    return ChangeStatistics(design.T @ design / noise**2, design.T @ observed / noise**2), observed
 
 
 def test_evidence_is_the_density_of_the_observations():
@@ -61,7 +61,7 @@ def test_sizes_and_moments_are_those_of_the_change():
 
 
 def test_observations_that_scatter_more_tell_less():
-    told = Told(np.diag([4.0, 9.0]), np.array([2.0, 3.0]))
+    told = ChangeStatistics(np.diag([4.0, 9.0]), np.array([2.0, 3.0]))
     half = told.with_noise(2.0)
     np.testing.assert_allclose(half.matrix, told.matrix / 4)
     np.testing.assert_allclose(half.right, told.right / 4)

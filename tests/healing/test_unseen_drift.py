@@ -39,7 +39,9 @@ def diagnosis_of(diagnostician, observed, poses, *changes):
         tried = diagnostician._with(best, *changes, start)
         prior, solution = tried.prior, tried.solution
     known = (1.0,) * len(changes), (None,) * len(changes)
-    return Diagnosis(changes, *known, observed, prior, solution, noise=1.0, rest=1.0)
+    return Diagnosis(
+        changes, *known, observed, prior, solution, noise=1.0, no_further_probability=1.0
+    )
 
 
 def seen_by_b(observed):

@@ -118,7 +118,7 @@ def test_image_far_from_all_calibrated_angles_is_outside():
 
 
 def test_unknown_interpolation_is_refused():
-    with pytest.raises(DataError, match='the interpolation is one of'):
+    with pytest.raises(DataError, match='the interpolation must be one of'):
         AngleMaps(calibration(), 'none')
 
 

@@ -25,7 +25,7 @@ from fluoro_calib_ros.images.light import Light, Noise, estimate_noise
 from fluoro_calib_ros.images.matching import PhantomModel, match
 from fluoro_calib_ros.images.measurement import circles, measure_beads
 from fluoro_calib_ros.images.shadow_fit import Absorbed, Profile, fit_profile, shadow_derivatives
-from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
+from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, lacks_certain_pose
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.radiographs import HARD, Radiography
 from fluoro_calib_ros.simulation.rig import VirtualRig, phantom_poses, virtual_rig
@@ -352,7 +352,7 @@ def test_another_phantom_is_refused():
     assert len(match(seen, PhantomModel.of(small_phantom(1)), LENS).bead) == 80
     with pytest.raises(DataError) as error:
         match(seen, PhantomModel.of(small_phantom(2)), LENS)
-    assert may_be_found(error.value.finding)
+    assert lacks_certain_pose(error.value.finding)
 
 
 @pytest.mark.parametrize('shift_mm', [0.3, 12.0])
@@ -472,7 +472,7 @@ def test_a_survey_with_wrong_beads_gives_no_wrong_observation():
 def test_an_image_without_beads_is_refused(image, kind):
     with refused(kind) as error:
         extract_beads(image, model(), LENS)
-    assert not may_be_found(error.value.finding)
+    assert not lacks_certain_pose(error.value.finding)
 
 
 def test_a_large_bead_among_small_ones_is_found_once():

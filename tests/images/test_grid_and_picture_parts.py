@@ -18,7 +18,7 @@ from fluoro_calib_ros.images.marker_decisions import DecidedView, ViewCounts
 from fluoro_calib_ros.images.marker_motion import MarkerStates, Motion
 from fluoro_calib_ros.images.marker_points import ShadowPoints, _explaining, shadow_points
 from fluoro_calib_ros.images.marker_rays import CalibratedRig, MarkerBodies, MarkerPlaces
-from fluoro_calib_ros.images.marker_views import JoinedViews, _later, _names, _Told
+from fluoro_calib_ros.images.marker_views import JoinedViews, _later, _names, _ViewPredictions
 from fluoro_calib_ros.images.view import Lens
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -316,7 +316,7 @@ def test_a_body_of_which_less_than_half_is_seen_again_is_elsewhere():
 @pytest.mark.parametrize('is_placed', [True, False])
 def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
     joined = JoinedViews.__new__(JoinedViews)
-    joined._views, joined._told, joined._by_body, joined._by_rays = [], [], [], []
+    joined._views, joined._predictions, joined._by_body, joined._by_rays = [], [], [], []
     joined._target_id, joined._rig = np.array([3, 5]), Fake(angles={})
     joined._measured = np.zeros((0, 2), dtype=bool)
     joined._missed, joined._again = np.array([True, False]), []
@@ -381,7 +381,7 @@ def test_what_is_told_is_expected_to_go_on_by_the_exposures_between():
     def at(x):
         return MarkerPlaces(np.array([[x, 0.0, 0]]), np.eye(3)[None])
 
-    told = _Told(at(0.0), at(0.0)).next(at(1.0), 4).next(at(3.0), 6)
+    told = _ViewPredictions(at(0.0), at(0.0)).next(at(1.0), 4).next(at(3.0), 6)
     # The motion is 2 mm in 2 exposures.
     assert told.expected(7).xyz_mm[0, 0] == 4.0 and told.expected(10).xyz_mm[0, 0] == 7.0
     assert (told.frame, told.frame_before) == (6, 4)
@@ -453,7 +453,7 @@ def test_views_are_told_where_unsure_markers_are_expected():
         present=at([1.0, 2.0, np.nan]), predicted=lambda frame: at([1.5, 3.0, np.nan])
     )
     told = at([7.0, 7.0, 8.0])
-    joined._told = [Fake(places=told, expected=lambda frame: at([9.0, 9.0, 10.0]))]
+    joined._predictions = [Fake(places=told, expected=lambda frame: at([9.0, 9.0, 10.0]))]
     joined._rig = Fake(
         project=lambda view, xyz: xyz[:, :2] * 10,
         spread=lambda view, xyz, covariance: xyz[:, 0] / 100,

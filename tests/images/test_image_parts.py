@@ -61,7 +61,7 @@ from fluoro_calib_ros.images.view import (
     assumed_lens,
     exponents,
     fit_view,
-    may_be_found,
+    lacks_certain_pose,
     shared_lens,
 )
 
@@ -202,8 +202,8 @@ def test_what_other_images_show_of_a_fluoroscope_helps_with_the_next():
     given, usual = assumed_lens((1000, 800), 3300.0), assumed_lens((1000, 800), None)
     assert (given.principal_distance_px, given.principal_distance_sd) == (3300, 0.08)
     assert (usual.principal_distance_px, usual.principal_distance_sd) == (4000, 0.25)
-    assert not may_be_found(None)
-    assert may_be_found(Finding(Kind.NO_POSE, '')) and not may_be_found(
+    assert not lacks_certain_pose(None)
+    assert lacks_certain_pose(Finding(Kind.NO_POSE, '')) and not lacks_certain_pose(
         Finding(Kind.FEW_BEADS, '')
     )
 
@@ -528,7 +528,7 @@ def test_a_turned_view_sees_the_moved_phantom_as_the_first_one_sees_the_phantom(
 
 
 def test_regular_phantoms_are_flat_grids():
-    with pytest.raises(DataError, match='no flat grid'):
+    with pytest.raises(DataError, match='not a flat grid'):
         PhantomModel.of(beads(), regular=True)
 
 

@@ -153,7 +153,7 @@ def test_a_sheet_without_mark_is_indexed_from_the_middle():
 
 def test_a_phantom_in_space_is_no_regular_grid():
     xyz = np.random.default_rng(2).uniform(-50, 50, (60, 3))
-    with pytest.raises(DataError, match='no flat grid'):
+    with pytest.raises(DataError, match='not a flat grid'):
         PhantomModel.of(xyz, regular=True)
 
 

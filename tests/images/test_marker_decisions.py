@@ -449,11 +449,11 @@ def test_a_marker_found_again_in_a_wide_gate_is_doubted(unseen, variance, is_dou
     watch, states, found, doubts = watched(
         PLACES, measured=[True, False, False, False], unseen=unseen, variance=variance
     )
-    told = watch.found_again(found, states, 30)
+    told = watch.recovered(found, states, 30)
     assert len(told) == is_doubted and doubts.doubtful.tolist() == [is_doubted] + [False] * 3
     if told:
         assert told[0].place.target_id == (3,) and told[0].numbers == {'images': 1}
-        assert doubts.since(0) == 30 and watch.found_again(found, states, 31) == ()
+        assert doubts.since(0) == 30 and watch.recovered(found, states, 31) == ()
 
 
 @pytest.mark.parametrize(

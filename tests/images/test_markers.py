@@ -382,8 +382,11 @@ def test_what_cannot_be_followed_is_said():
     [
         (([], np.zeros((0, 2))), 'has no markers'),
         (([1, 1], np.ones((2, 2))), 'marker 1 occurs twice'),
-        (([1, 2], np.array([[5, 5], [np.nan, 5]])), 'marker 2 of the first frame has no place'),
-        (([1], np.ones((2, 2))), 'places of shape'),
+        (
+            ([1, 2], np.array([[5, 5], [np.nan, 5]])),
+            'marker 2 of the first frame has no image point',
+        ),
+        (([1], np.ones((2, 2))), 'image points of shape'),
     ],
 )
 def test_a_wrong_first_frame_is_refused(first, reason):
@@ -395,7 +398,7 @@ def test_a_first_image_without_the_markers_is_refused():
     image = sequence()[1][0]['a'].image
     rng = np.random.default_rng(0)
     plain = np.clip(rng.normal(30000, 600, image.shape), 0, 65535).astype(np.uint16)
-    with pytest.raises(DataError, match='nothing round where the markers should be'):
+    with pytest.raises(DataError, match='no round shadow where the markers are expected'):
         MarkerTracker(first=given('a')).update(plain, 1)
     far = FirstMarkers(np.array([1]), np.array([[SIZE + 9.0, 20.0]]))
     with pytest.raises(DataError, match='lies outside of the image'):
@@ -530,11 +533,9 @@ def test_the_command_refuses_what_does_not_fit(folder, capsys):
 
     assert 'give --phantom' in said('--fluoroscope', 'a')
     markers = ('--markers', folder / 'first.csv')
-    assert 'with their --calibration' in said(*markers, '--fluoroscope', 'a,b')
+    assert 'need their --calibration' in said(*markers, '--fluoroscope', 'a,b')
     bodies = ('--bodies', folder / 'bodies.csv')
-    assert 'bodies are for two fluoroscopes or more' in said(
-        *markers, *bodies, '--fluoroscope', 'a'
-    )
+    assert 'bodies need two fluoroscopes or more' in said(*markers, *bodies, '--fluoroscope', 'a')
     assert 'as --cluster does' in said(*bodies, '--cluster', 'one: 1 2', '--fluoroscope', 'a,b')
     write_bodies(folder / 'bodies.csv', followed_bodies())
     two = ('--fluoroscope', 'a,b', '--calibration', folder / 'result')

@@ -419,10 +419,10 @@ def test_a_marker_found_again_in_a_wide_gate_is_doubtful():
     few = 0.02 / (np.pi * 4.0**2 * 1e-4)  # variance at which 0.02 false shadows are expected
     variance = few * np.array([1.1, 0.9, 1.1, 1.1, 1.1])
     watch, doubts, states = watched(at, variance, [2, 5, 1, 4, 9])
-    told = watch.found_again(found_at(at, [1, 1, 1, 0, 1]), states, 3)
+    told = watch.recovered(found_at(at, [1, 1, 1, 0, 1]), states, 3)
     assert [one.place.target_id for one in told] == [(10,), (14,)]
     assert [one.numbers['images'] for one in told] == [1, 8]
-    assert not watch.found_again(found_at(at, [1, 1, 1, 0, 1]), states, 4)
+    assert not watch.recovered(found_at(at, [1, 1, 1, 0, 1]), states, 4)
     assert doubts.doubtful.tolist() == [True, False, False, False, True]
 
 

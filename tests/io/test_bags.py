@@ -607,7 +607,7 @@ WRONG = [
     (dict(v=np.zeros(31)), '30 target ids, but 31 values of v'),
     (dict(sigma=np.ones(3)), '30 target ids, but 3 values of sigma'),
     (dict(u=np.full(30, np.nan)), 'is not a number'),
-    (dict(u=np.full(30, 5000.0)), 'is off the image'),
+    (dict(u=np.full(30, 5000.0)), 'is outside the image'),
     (dict(sigma=np.zeros(30)), 'is not a positive number'),
     (dict(target_id=np.full(30, 7, dtype=np.uint32)), 'target 7 occurs 30 times'),
     (dict(image_width=0), 'the image size is 0 x 960 px'),

@@ -317,7 +317,7 @@ def changed(lines, row, text):
     ('row', 'text', 'sentence'),
     [
         (2, '1024', 'row 2: 1 numbers, but MayaCam 2.0 has 2 here'),
-        (4, 'camera', "row 4: 'camera' stands where MayaCam 2.0 has the line 'camera matrix'"),
+        (4, 'camera', "row 4: 'camera' is where MayaCam 2.0 has the line 'camera matrix'"),
         (6, '0,x,1', "row 6: column 2 is 'x', not a number"),
         (10, '1,1,1', 'row 10: the matrix is not a rotation, its rows are not orthonormal'),
     ],
@@ -336,7 +336,7 @@ def test_unit_is_never_silent(tmp_path):
     written = registry.write(tmp_path, 'mayacam2', Content(cameras=cameras()), FileSettings())
     assert 'lengths in mm' in written.notes[0]
     with pytest.raises(
-        DataError, match=r'does not say the unit of its lengths, --units mm\|cm\|m'
+        DataError, match=r'does not state the unit of its lengths, --units mm\|cm\|m'
     ):
         registry.read(tmp_path, FileSettings())
 

@@ -82,7 +82,7 @@ def test_worst_document_stays_in_its_part_of_the_budget(case):
 
 @pytest.mark.parametrize('kind', PARSE)
 def test_document_beyond_the_limit_is_not_parsed(kind):
-    with pytest.raises(DataError, match=f'^f: the {kind} text has .* MB are not read$'):
+    with pytest.raises(DataError, match=f'^f: the {kind} text has .* MB; the limit is .* MB$'):
         PARSE[kind](' ' * (DOCUMENT_BYTES[kind] + 1), 'f')
 
 
@@ -138,7 +138,7 @@ def test_nested_file_of_opencv_is_refused(tmp_path):
 def test_table_of_very_many_rows_is_not_read(tmp_path, kind):
     path = tmp_path / 'table.csv'
     path.write_text('1\n' * (MAX_ROWS + 1))
-    with pytest.raises(DataError, match=r'rows, more than \d+ are not read'):
+    with pytest.raises(DataError, match=r'rows; the limit is \d+'):
         registry.read(path, FileSettings(image_size=(9, 9)), kind)
 
 

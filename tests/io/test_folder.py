@@ -279,7 +279,7 @@ def test_output_that_would_destroy_something_is_refused(tmp_path, capsys):
     for out, said in (
         (source, 'would be overwritten'),
         (tmp_path / 'rig', 'would be overwritten'),
-        (source / 'result', 'lies in the input'),
+        (source / 'result', 'is inside the input'),
         (phantom, 'this is a file'),
         ('/dev/null', 'this is a device'),
         (tmp_path / 'pipe', 'this is a pipe'),

@@ -72,7 +72,7 @@ def test_numbers_that_begin_again_become_different(tmp_path, frames):
     }
     write_bag(tmp_path / 'bag', {name: [*frames[name], *again[name]] for name in frames})
     recording = read_source(tmp_path / 'bag', collect='all')
-    assert 'the frame numbers begin again (a 1, b 1 times)' in recording.notes[0]
+    assert 'the frame numbers restart (a 1, b 1 times)' in recording.notes[0]
     found = recording.frames
     first = [frame.number for frame in frames['a']]
     step = 10 ** len(str(max(first)))

@@ -430,8 +430,8 @@ COLOUR = cv2.imencode('.png', np.stack([image_of(), image_of(1), image_of(2)], a
     1
 ].tobytes()
 BAD = {  # file: content, message
-    'no.xyz': (b'x', 'files with the ending .xyz cannot be read'),
-    'text.png': (b'this is text', 'no image that can be decoded, or it is damaged'),
+    'no.xyz': (b'x', 'files with the suffix .xyz cannot be read'),
+    'text.png': (b'this is text', 'not an image that can be decoded, or it is damaged'),
     'empty.png': (b'', 'the file is empty'),
     'cut.png': (PNG[:-30], 'the PNG image is cut off'),
     'damaged.png': (flipped(PNG), 'the PNG image is damaged'),
@@ -443,10 +443,10 @@ BAD = {  # file: content, message
     'cut_plain.tif': (PLAIN_TIF[: len(PLAIN_TIF) * 2 // 3], 'it is cut off or damaged'),
     'cut_plain_little.tif': (PLAIN_TIF[:-5], 'page 4 of 4 is damaged or cut off'),
     'circle.tif': (in_a_circle(PLAIN_TIF), 'it is cut off or damaged'),
-    'head.tif': (TIF[:3], 'this is no TIFF file'),
-    'text.tif': (b'this is text', 'this is no TIFF file'),
-    'text.avi': (b'this is text', 'no video that can be read'),
-    'empty.mp4': (b'', 'no video that can be read'),
+    'head.tif': (TIF[:3], 'this is not a TIFF file'),
+    'text.tif': (b'this is text', 'this is not a TIFF file'),
+    'text.avi': (b'this is text', 'not a video that can be read'),
+    'empty.mp4': (b'', 'not a video that can be read'),
     'colour.png': (COLOUR, 'this is a colour image'),
     'float.tif': (
         cv2.imencode('.tif', image_of().astype(np.float32))[1].tobytes(),
@@ -509,9 +509,9 @@ def test_impossible_outputs_are_refused(one, both, tmp_path, capfd):
     (tmp_path / 'empty').mkdir()
     for source, out, sentence in (
         (eight, 'nowhere/x.png', 'there is no folder'),
-        (eight, 'x.xyz', 'the ending .xyz is none of an image'),
-        (eight, 'x', 'the ending (none) is none'),
-        (eight, 'x.avi', 'the ending .avi is none of an image'),
+        (eight, 'x.xyz', 'the suffix .xyz is not that of an image'),
+        (eight, 'x', 'the suffix (none) is not'),
+        (eight, 'x.avi', 'the suffix .avi is not that of an image'),
         (eight, '8.png', '8.png would be overwritten, choose another output file'),
         (eight, 'folder', 'this is a folder'),
         (deep, 'x.jpg', '16 bits cannot be written as jpg'),
@@ -611,7 +611,7 @@ def test_images_of_a_video_are_corrected_each_at_its_angle(turning, tmp_path, ca
     'text, cause',
     [
         ('image,angle_deg\n0,3\n', "row 2: image is '0', the first image is 1"),
-        ('image,angle_deg\n1,3\n1,4\n', 'row 3: image 1 is in row 2, too'),
+        ('image,angle_deg\n1,3\n1,4\n', 'row 3: image 1 is already in row 2'),
         ('image,angle_deg\n1,9999\n', "row 2: angle_deg is '9999', not an angle"),
         ('image,angle_deg\n1,x\n', "row 2: angle_deg is 'x', not a number"),
         ('image\n1\n', 'angle_deg'),

@@ -172,7 +172,7 @@ def test_convert_says_what_becomes_of_angles(tmp_path, capsys):
     bag = write_bag(tmp_path / 'bag', STATES)
     words = ('convert', bag, '--angle-joint', 'carm')
     assert rigs.run(*words, '--to', 'bag', '--out', tmp_path / 'other') == 0
-    assert 'does not hold the angles of the C-arm' in capsys.readouterr().err
+    assert 'has no angles of the C-arm' in capsys.readouterr().err
     assert rigs.run('convert', bag, '--to', 'bag', '--out', tmp_path / 'another') == 0
     assert 'angle' not in capsys.readouterr().err
     converted(tmp_path / 'o.csv', bag)
@@ -225,7 +225,7 @@ def test_joint_of_the_rig_may_be_without_times_but_not_missing_in_a_bag(tmp_path
     again = read_source(tmp_path / 'o.csv', image_size=SIZE, selection=rig).frames
     assert [f.angle for f in again['a']] == [f.angle for f in frames['a']]
     bag = write_bag(tmp_path / 'still', [])
-    with pytest.raises(DataError, match=r'no joint states.*leaves it out'):
+    with pytest.raises(DataError, match=r'no joint states.*disables it'):
         read_source(bag, selection=rig)
 
 

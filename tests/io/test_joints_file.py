@@ -86,7 +86,7 @@ def test_joints_are_read(tmp_path):
         (('[3, 40]', '[3.5, 40]'), 'key neutral'),
         (('side =', 'sides ='), 'key sides: unknown'),
         (('[0, 0, 400]', '[0, 0, nan]'), 'femoral_head has a number that is not finite'),
-        (('[0, 0, 400]', f'[0, 0, 1{"0" * 400}]'), 'a whole number is too large'),
+        (('[0, 0, 400]', f'[0, 0, 1{"0" * 400}]'), 'an integer is too large'),
         (('[0, 0, 400]', '[' * (MAX_DEPTH + 1) + ']' * (MAX_DEPTH + 1)), 'nested too deeply'),
         (('landmarks]', 'a.' * MAX_DEPTH + 'landmarks]'), 'nested too deeply'),
         (('[0, 0, 400]', '[0, 400]'), 'femoral_head does not have 3 numbers'),
@@ -118,7 +118,7 @@ def test_faults_are_named(tmp_path, change, cause):
 
 def test_a_file_beyond_the_budget_of_documents_is_not_parsed(tmp_path):
     path = written(tmp_path, KNEE + '#' * DOCUMENT_BYTES['TOML'])
-    with pytest.raises(DataError, match=r'the TOML text has .* MB are not read'):
+    with pytest.raises(DataError, match=r'the TOML text has .* MB; the limit is .* MB'):
         read_joints(path, BODIES)
 
 
@@ -142,7 +142,7 @@ def test_a_file_beyond_the_budget_of_documents_is_not_parsed(tmp_path):
             ),
             'isb_ankle has no landmarks',
         ),
-        ('[[joint]]\n' * (MAX_JOINTS + 1), f'more than {MAX_JOINTS}'),
+        ('[[joint]]\n' * (MAX_JOINTS + 1), f'the limit is {MAX_JOINTS}'),
     ],
 )
 def test_wrong_files_are_refused(tmp_path, text, cause):

@@ -74,7 +74,7 @@ def test_size_of_files(limited, tmp_path):
     path.write_bytes(bytes(1_100_000))
     access.read_bytes(path)
     limited(max_file_mb=1)
-    said = f'{path}: the file has 1 MB, more than 1 MB are not read'
+    said = f'{path}: the file has 1 MB; the limit is 1 MB'
     assert refused(access.read_bytes, path) == said
 
 
@@ -91,7 +91,7 @@ def test_training_points_of_calibrations(limited, tmp_path):
     limited(max_training_points=30)
     load_calibration(path)
     limited(max_training_points=29)
-    assert '30 training points, more than 29 are not read' in refused(load_calibration, path)
+    assert '30 training points; the limit is 29' in refused(load_calibration, path)
 
 
 def test_targets_of_phantoms(limited, tmp_path):
@@ -108,7 +108,7 @@ def test_fluoroscopes_of_orientations(limited, tmp_path):
     limited(max_fluoroscopes=2)
     load_orientation(path)
     limited(max_fluoroscopes=1)
-    assert 'has 2 fluoroscopes, more than 1 are not read' in refused(load_orientation, path)
+    assert 'has 2 fluoroscopes; the limit is 1' in refused(load_orientation, path)
 
 
 def test_length_of_names(limited):
@@ -123,7 +123,7 @@ def test_command_line_sets_limits(tmp_path, capsys):
     save_calibration(tmp_path, some_calibration())
     arguments = ('correct', path, '--calibration', tmp_path, '--out', tmp_path / 'out.csv')
     assert rigs.run(*arguments, '--max-file-mb', '1') == 1
-    assert 'points.csv: the file has 1 MB, more than 1 MB are not read' in capsys.readouterr().err
+    assert 'points.csv: the file has 1 MB; the limit is 1 MB' in capsys.readouterr().err
     assert not (tmp_path / 'out.csv').exists()
     path.write_text('u,v\n1,2\n')
     assert rigs.run(*arguments) == 0

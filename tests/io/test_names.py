@@ -25,8 +25,8 @@ def test_names_return(tmp_path):
     ('row', 'sentence'),
     [
         ('bead,1,a', "row 2: kind is 'bead', not target, exposure, fluoroscope"),
-        ('target,x,a', "row 2: id is 'x', not a whole number"),
-        ('target,-1,a', "row 2: id is '-1', not a whole number"),
+        ('target,x,a', "row 2: id is 'x', not an integer"),
+        ('target,-1,a', "row 2: id is '-1', not an integer"),
         ('fluoroscope,../a,a', "row 2: the fluoroscope is called '../a'"),
         ('target,1,a\ntarget,1,b', "row 3: the target 'b', id 1, is given twice"),
         ('target,1,a\ntarget,2,a', "row 3: the target 'a', id 2, is given twice"),

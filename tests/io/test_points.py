@@ -228,7 +228,7 @@ def test_a_folder_of_deeplabcut_returns(tmp_path):
         (
             PREDICTED.replace('10.5', '1e9'),
             SETTINGS,
-            'row 4: the point (1e+09, 20.25) is off the image',
+            'row 4: the point (1e+09, 20.25) is outside the image',
         ),
         (PREDICTED.replace('fem', 'tib lat'), SETTINGS, "row 2: the body part 'tib lat' is"),
         (
@@ -339,7 +339,7 @@ def test_no_code_of_a_file_of_deeplabcut_is_run(tmp_path):
         (lambda p: pandas_table(p, PREDICTED, b'(lp0\n'), 'pickle exhausted before'),
         (
             lambda p: pandas_table(p, PREDICTED, stored(['x'] * 6)),
-            'its columns ha',
+            'its columns ',
         ),
         (lambda p: pandas_table(p, PREDICTED, stored([('x', 'y')] * 6)), '2 head'),
         (lambda p: pandas_fixed(p, LABELLED, nblocks=2), 'its columns are not of one kind'),
@@ -420,7 +420,7 @@ def test_a_folder_of_sleap_returns(tmp_path):
 @pytest.mark.parametrize(
     ('others', 'cause'),
     [
-        ({'node_names': None}, 'it is no analysis file of SLEAP'),
+        ({'node_names': None}, 'it is not an analysis file of SLEAP'),
         ({'node_names': np.array([b'hip'] * 2)}, 'two points have the same name'),
         ({'node_names': np.array([b'hip'])}, 'tracks, point_scores and node_names are of'),
         ({'point_scores': np.ones((2, 2, 5))}, 'tracks, point_scores and node_names are of'),
@@ -434,7 +434,9 @@ def test_hdf5_of_something_else_is_refused(tmp_path, others, cause):
 
 def test_points_of_sleap_off_the_image_are_named(tmp_path):
     path = sleap_file(tmp_path / 'a.h5', ('track', 'xy', 'node', 'frame'))
-    with pytest.raises(DataError, match=r'frame 2: the point .* is off the image of 35 x 42 px'):
+    with pytest.raises(
+        DataError, match=r'frame 2: the point .* is outside the image of 35 x 42 px'
+    ):
         registry.read(path, FileSettings(image_size=(35, 42)))
 
 
@@ -497,10 +499,13 @@ def test_semicolons_with_decimal_commas_are_recognised(tmp_path):
         ('m_cam1_X,m_cam1_Y\n1,x\n', "row 2: column 2 is 'x', not a number"),
         ('m_cam1_X,m_cam1_Y\n1,2,3\n', 'row 2: 3 columns, but the header has 2'),
         ('m_cam1_X,m_cam2_Y\n1,2\n', 'row 1: the column m_cam1_X is not followed by m_cam1_Y'),
-        ('m_cam1_X,m_cam1_Y\n1,900\n', 'row 2: the point (1, 900) of m in cam1 is off the image'),
+        (
+            'm_cam1_X,m_cam1_Y\n1,900\n',
+            'row 2: the point (1, 900) of m in cam1 is outside the image',
+        ),
         (
             'm_cam1_X,m_cam1_Y,n_cam2_X,n_cam2_Y\n1,2,3,4\n5,6,7,900\n',
-            'row 3: the point (7, 900) of n in cam2 is off the image',
+            'row 3: the point (7, 900) of n in cam2 is outside the image',
         ),
         ('m_cam1_X,m_cam1_Y,m_cam1_X,m_cam1_Y\n1,2,1,2\n', 'row 1: m_cam1 is given twice'),
         ('m_cam1_X,m_cam1_Y\n', 'the file has a header, but no rows'),
@@ -515,7 +520,7 @@ def test_wrong_xmalab_points_name_the_row(tmp_path, text, sentence):
 def test_columns_mixing_ids_and_names_are_refused(tmp_path):
     path = tmp_path / 'points.csv'
     path.write_text('fluoroscope,exposure,target_id,u,v\na,1,3,5,5\na,1,bead4,6,6\n')
-    assert refused(path) == f"{path}, row 3: target_id is 'bead4', not a whole number"
+    assert refused(path) == f"{path}, row 3: target_id is 'bead4', not an integer"
 
 
 # ---- phantoms
@@ -619,7 +624,7 @@ def test_wrong_files_of_chow_et_al_name_the_row(tmp_path):
     path = tmp_path / 'bundle.pho'
     lines = path.read_text().splitlines()
     path.write_text('\n'.join([*lines[:3], lines[3].replace('-', '', 1)]))
-    assert 'row 4: the point is off the image of 1024 x 768 px; y is negative' in refused(path)
+    assert 'row 4: the point is outside the image of 1024 x 768 px; y is negative' in refused(path)
     path.write_text('\n'.join([lines[0], lines[0]]))
     assert 'row 2: target 7 of this station is already given in row 1' in refused(path)
     path.write_text('1 2 3\n')
@@ -822,7 +827,7 @@ def test_xmalab_3d_points_of_a_lab_are_read(tmp_path):
     found = registry.read(path, FileSettings(units='cm')).points
     assert found.frame.tolist() == [1, 2]
     assert found.xyz_mm[1, 1].tolist() == [70, 80, 90] and np.isnan(found.xyz_mm[0, 1]).all()
-    assert 'does not say the unit' in refused(path, FileSettings())
+    assert 'does not state the unit' in refused(path, FileSettings())
 
 
 # ---- rigid bodies

@@ -266,5 +266,5 @@ def test_folder_of_a_scanner_is_read_in_the_order_of_its_numbers(tmp_path):
     listed = list_images(tmp_path)
     assert [str(path) for path in listed.written] == ['1.3.12.0007.tif', '1.3.12.0012.tif']
     assert listed.passed_over == ('DICOMDIR', 'notes')
-    with pytest.raises(DataError, match='none of an image'):
+    with pytest.raises(DataError, match='not that of an image'):
         open_images(tmp_path / 'DICOMDIR')

@@ -70,8 +70,8 @@ def test_a_folder_as_it_was_written_passes_without_a_word(folder, capsys):
 def test_an_exchanged_calibration_is_named(folder, capsys):
     exchange(folder)
     sentence = (
-        f'{folder}: the calibration file of a and result.json are of different calibrations: one '
-        'of them was exchanged'
+        f'{folder}: the calibration file of a and result.json belong to different calibrations: '
+        'one of them was replaced'
     )
     assert correct(folder) == 0
     assert capsys.readouterr().err.startswith(sentence)

@@ -126,7 +126,7 @@ def test_distortion_that_a_model_cannot_take_is_diagnosed_and_does_not_pass():
         diagnosis=SimpleNamespace(changes=changes[:1], probability=(1,)),
     )
     lines = _lines(Namespace(out='out'), found)
-    assert lines[0] == 'it stays as it was calibrated, nothing is written'
+    assert lines[0] == 'the calibration stays as it was, nothing is written'
 
 
 def test_recording_that_three_changes_do_not_explain_does_not_pass():

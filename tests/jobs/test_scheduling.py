@@ -198,7 +198,7 @@ def test_who_has_no_certificate_of_the_cluster_gets_and_gives_nothing(tmp_path, 
     'address', ['tcp://10.0.0.7:8786', '10.0.0.7:8786', 'tcp://lab:8786', 'tcp://127.lab:1']
 )
 def test_plain_tcp_to_another_machine_needs_a_trusted_network(address):
-    with pytest.raises(DataError, match='whoever reaches this scheduler can run code here'):
+    with pytest.raises(DataError, match='anyone who reaches this scheduler can run code here'):
         open_workers(scheduler=address)
     assert Cluster(address, trusted_network=True).security() is None
 
@@ -233,7 +233,10 @@ def test_results_keep_the_order_of_their_tasks_and_few_tasks_are_in_memory():
 
 
 def test_a_worker_that_dies_is_told():
-    with LocalWorkers(2) as workers, pytest.raises(DataError, match='worker process was ended'):
+    with (
+        LocalWorkers(2) as workers,
+        pytest.raises(DataError, match='worker process was terminated'),
+    ):
         list(workers.map(os._exit, [1, 1]))
 
 

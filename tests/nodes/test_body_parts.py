@@ -396,7 +396,7 @@ def test_diagnostics_of_a_body_from_unseen_to_lost():
 FAULTS = {
     'body x y,1,0,0,0,0.1\nbody x y,2,1,0,0,0.1\nbody x y,3,0,1,0,0.1\n': "body 'body x y'",
     'femur,1,0,0,0,0.1\nfemur,2,1,0,0,0.1\nfemur,3,0,1,0,\n': 'marker 3 has no standard deviation',
-    'femur,1,0,0,0,0.1\nfemur,2,1,0,0,0.1\nfemur,3,,,,\n': 'the places of 2 of its 3 markers',
+    'femur,1,0,0,0,0.1\nfemur,2,1,0,0,0.1\nfemur,3,,,,\n': 'only 2 of its 3 markers',
 }
 
 

@@ -139,7 +139,7 @@ def test_id_of_earlier_versions_is_refused(changed):
         ({'image_sd': 1e308}, 'image_sd holds a value beyond'),
         ({'interior': np.array([1.0, 1.0, -1.0])}, 'principal distance is -1 px'),
         ({'model': (2000, 3000)}, 'model_k holds a value beyond 1000'),
-        ({'model': (5, 1001)}, 'training points lie on one place'),
+        ({'model': (5, 1001)}, 'training points coincide in the image'),
     ],
 )
 def test_hostile_calibration_with_a_valid_id_is_refused(change, sentence):

@@ -340,7 +340,7 @@ def test_a_rig_that_is_not_calibrated_is_refused_before_the_capture():
     ],
 )
 def test_impossible_timeout_is_refused(seconds, said):
-    with pytest.raises(ValueError, match=f'timeout_sec is a time in .*{said}'):
+    with pytest.raises(ValueError, match=f'timeout_sec must be a time in .*{said}'):
         check_timeout(seconds)
 
 

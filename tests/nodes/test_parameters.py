@@ -103,7 +103,7 @@ def test_times_that_a_node_cannot_wait_are_refused():
     check_timeout(1e-3)
     check_timeout(MAX_TIMEOUT_S)
     for wrong in (0.0, -1.0, float('nan'), 1.001 * MAX_TIMEOUT_S, float('inf')):
-        with pytest.raises(ValueError, match='timeout_sec is a time in seconds'):
+        with pytest.raises(ValueError, match='timeout_sec must be a time in seconds'):
             check_timeout(wrong)
 
 
@@ -158,14 +158,14 @@ def test_a_group_becomes_an_options_object(make_node):
 @pytest.mark.parametrize(
     'values, sentence',
     [
-        ({'length': 11.0}, 'parameter length is between 0 and 10, not 11'),
-        ({'length': 11}, 'parameter length is between 0 and 10, not 11'),
-        ({'length': 'abc'}, "parameter length is a number, not 'abc'"),
-        ({'count': 0}, 'parameter count is 1 at least, not 0'),
-        ({'count': 1.5}, 'parameter count is a whole number, not 1.5'),
-        ({'names': 'x'}, r"parameter names is a list of texts, such as \[a, b\], not 'x'"),
+        ({'length': 11.0}, 'parameter length must be between 0 and 10, not 11'),
+        ({'length': 11}, 'parameter length must be between 0 and 10, not 11'),
+        ({'length': 'abc'}, "parameter length must be a number, not 'abc'"),
+        ({'count': 0}, 'parameter count must be at least 1, not 0'),
+        ({'count': 1.5}, 'parameter count must be an integer, not 1.5'),
+        ({'names': 'x'}, r"parameter names must be a list of strings, such as \[a, b\], not 'x'"),
         ({'count': 13}, 'parameter count: 13 brings bad luck'),
-        ({'kind': 'c'}, "parameter kind is one of a, b, not 'c'"),
+        ({'kind': 'c'}, "parameter kind must be one of a, b, not 'c'"),
     ],
 )
 def test_invalid_values_name_the_parameter(make_node, values, sentence):

@@ -146,7 +146,7 @@ def test_exposure_with_two_targets_is_reported():
     assert len(found) == 2 and all(
         name.startswith('exposure 12 of a') for names in found for name in names
     )
-    assert describe_directions(found) == 'the orientation of exposure 12 of a is left open'
+    assert describe_directions(found) == 'the orientation of exposure 12 of a is undetermined'
     assert not undetermined_directions(
         rigs.small_network()[0], rigs.small_network()[1], ('a',), [1, 2, 3, 4]
     )

@@ -244,10 +244,10 @@ def test_resection_is_robust_to_false_matches_and_distortion(seed):
     'spoil, message',
     [
         (lambda xyz: xyz[:7], '7 targets are too few for a resection, 8 are needed'),
-        (lambda xyz: xyz * (1, 1, 0), 'all targets lie in one plane'),
+        (lambda xyz: xyz * (1, 1, 0), 'all targets are coplanar'),
         (
             lambda xyz: xyz @ np.diag([1, 1, 1e-4]) @ matrix_from_vector([1.0, 2, 3]),
-            'all targets lie in one plane',
+            'all targets are coplanar',
         ),
     ],
 )
@@ -484,7 +484,7 @@ def some_phantom():
         ),
         (
             {'uv': np.array([[1, 1], [2, 2], [3, 3], [639.6, 4]])},
-            'target 4 is off the image of 640 x 480 px',
+            'target 4 is outside the image of 640 x 480 px',
         ),
         ({'target_id': np.array([5, 3, 5, 4])}, 'target 5 occurs 2 times'),
         ({'target_id': np.array([5, 3, 8, 4])}, 'target 8 is not on the phantom'),
@@ -534,9 +534,9 @@ def test_phantom_is_sorted_and_looked_up_by_id():
         ({'target_id': [1, 2, 3]}, '3 target ids, but coordinates of shape'),
         (
             {'xyz_mm': np.where(np.arange(12).reshape(4, 3) == 7, np.nan, 1.0)},
-            'target 3 has a wrong coordinate',
+            'target 3 has an invalid coordinate',
         ),
-        ({'sd_mm': [0.1, 0.0, 0.1, 0.1]}, 'target 2 has a wrong sd'),
+        ({'sd_mm': [0.1, 0.0, 0.1, 0.1]}, 'target 2 has an invalid sd'),
         (
             {'target_id': [1, 2, 3], 'xyz_mm': np.zeros((3, 3)), 'sd_mm': np.ones(3)},
             '3 targets are too few',

@@ -442,7 +442,7 @@ def test_rays_that_do_not_meet_in_front_of_the_sources():
     assert set(Intersector(same).intersect(np.full((2, 3, 2), 400.0), np.ones((2, 3))).status) == {
         FAILED
     }
-    with pytest.raises(DataError, match='sources in one place'):
+    with pytest.raises(DataError, match='coincident sources'):
         EpipolarGeometry(same, 'a', 'b')
 
 
@@ -463,13 +463,13 @@ def test_empty_frame_and_wrong_shapes():
     [
         (
             {'fluoroscopes': ('a', 'a')},
-            'the fluoroscopes are a, a, but each must have a name of its own',
+            'the fluoroscopes are a, a, but each needs a unique name',
         ),
         ({'calibration_ids': ('a',)}, '2 fluoroscopes, but 1 calibrations'),
         ({'optical_frame_ids': ('a',)}, '2 fluoroscopes, but 1 optical frames'),
         (
             {'source': 'guess'},
-            "its source is one of capture, joint calibration, healing, not 'guess'",
+            "its source must be one of capture, joint calibration, healing, not 'guess'",
         ),
         ({'frame_id': ''}, 'the rig frame has no name'),
         ({'position_mm': np.zeros(3)}, r'position_mm has shape \(3,\), not \(2, 3\)'),

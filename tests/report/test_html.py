@@ -192,7 +192,7 @@ def test_standard_deviation_of_a_correction_is_that_at_the_angles_of_the_exposur
     [
         ('pass', 'This calibration can be used.'),
         ('fail', 'Do not use this calibration.'),
-        ('cannot tell', 'It cannot be told whether'),
+        ('cannot tell', 'The checks cannot decide whether'),
     ],
 )
 def test_verdict_and_what_to_do_come_first(folder, tmp_path, text_only, verdict, sentence):
@@ -326,7 +326,7 @@ def test_what_is_no_small_jpeg_is_refused(folder, tmp_path, content):
     copy = shutil.copytree(folder, tmp_path / 'result')
     number = read_report_input(copy).frames['a'][0].number
     write_radiographs(copy, {'a': {number: content}})
-    with pytest.raises(DataError, match=f'a_{number}.jpg: this is no '):
+    with pytest.raises(DataError, match=f'a_{number}.jpg: this is not a '):
         read_report_input(copy)
 
 

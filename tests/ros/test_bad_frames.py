@@ -60,7 +60,7 @@ BAD = {  # change of the message, nodes that refuse it, what they report
     'infinite sigma': (sigma_of(np.inf), BOTH, 'is not a positive number'),
     'NaN': (put('u', 3, np.nan), COLLECTS, 'is not a number'),
     'infinite': (put('v', 3, -np.inf), COLLECTS, 'is not a number'),
-    'off the image': (put('v', 3, 1024.0), COLLECTS, 'is off the image of 1024 x 1024 px'),
+    'outside the image': (put('v', 3, 1024.0), COLLECTS, 'is outside the image of 1024 x 1024 px'),
     'unknown target': (
         put('target_id', -1, 99999),
         COLLECTS,
@@ -71,7 +71,7 @@ BAD = {  # change of the message, nodes that refuse it, what they report
 ONE_POINT = {
     'NaN',
     'infinite',
-    'off the image',
+    'outside the image',
 }  # the correction marks this point and corrects the others
 
 

@@ -62,7 +62,9 @@ def test_capture_needs_all_fluoroscopes_and_a_new_frame(graph, exposures, tmp_pa
     client.end_stream()
     assert not answer.success and answer.message == 'frame 7 is collected already'
     answer = client.call(Capture, 'capture', timeout_sec=-1.0)
-    assert not answer.success and answer.message == 'timeout_sec is a time in seconds, not -1.0'
+    assert (
+        not answer.success and answer.message == 'timeout_sec must be a time in seconds, not -1.0'
+    )
 
 
 def test_standing_phantom_gives_one_exposure_and_a_moving_one_none(graph, exposures, tmp_path):

@@ -78,4 +78,4 @@ def test_node_that_does_not_end_is_ended(ros):
         node.send_signal(signal.SIGINT)
         _, log = node.communicate(timeout=END_S)
     assert node.returncode == 1
-    assert 'ended by force: the work in hand takes longer than 1.5 s' in log
+    assert 'ended by force: the current work takes longer than 1.5 s' in log

@@ -263,7 +263,7 @@ BAD = {  # change of the message, kind, what is reported
 GREY = np.arange(1024 * 1024, dtype=np.uint32).reshape(1024, 1024).astype(np.uint8)
 BAD_COMPRESSED = {
     'empty': (array('B'), 'damaged', 'it has no data'),
-    'no image': (array('B', b'this is no image'), 'damaged', 'no image that can be decoded'),
+    'no image': (array('B', b'this is no image'), 'damaged', 'not an image that can be decoded'),
     'cut off': (of_array(GREY)[:-100], 'damaged', 'the PNG image is cut off'),
     'cut off jpeg': (array('B', encode(GREY, '.jpg'))[:-100], 'damaged', 'damaged'),
     'in colours': (
@@ -385,9 +385,9 @@ def test_calibrations_change_between_two_images(graph, by_command, pictures):
 def test_invalid_parameters_are_refused(graph):
     """The node does not start and gives the reason."""
     wrong = {
-        'interpolation': ('nearest', 'parameter interpolation is one of linear, cubic'),
-        'inputs': ('none', 'parameter inputs is one of raw, compressed, both'),
-        'compressed_format': ('gif', 'parameter compressed_format is one of png, jpeg'),
+        'interpolation': ('nearest', 'parameter interpolation must be one of linear, cubic'),
+        'inputs': ('none', 'parameter inputs must be one of raw, compressed, both'),
+        'compressed_format': ('gif', 'parameter compressed_format must be one of png, jpeg'),
         'jpeg_quality': (0, 'parameter jpeg_quality'),
     }
     processes = [

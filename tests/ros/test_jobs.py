@@ -163,18 +163,18 @@ def test_second_request_is_refused_while_one_runs(rig):
 @pytest.mark.parametrize(
     'request_fields, message',
     [
-        ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, there are a, b'),
+        ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, expected one of a, b'),
         (
             {'model': 'spline'},
-            'model is one of auto, none, knn, local_linear, parametric, hybrid, collocation, '
+            'model must be one of auto, none, knn, local_linear, parametric, hybrid, collocation, '
             "not 'spline'",
         ),
-        ({'interior': 'free'}, "interior is one of estimated, fixed, not 'free'"),
-        ({'loss': 'cauchy'}, "loss is one of student_t, huber, gaussian, not 'cauchy'"),
-        ({'principal_distance': -1.0}, 'principal_distance is a length in pixels, not -1.0'),
+        ({'interior': 'free'}, "interior must be one of estimated, fixed, not 'free'"),
+        ({'loss': 'cauchy'}, "loss must be one of student_t, huber, gaussian, not 'cauchy'"),
+        ({'principal_distance': -1.0}, 'principal_distance must be a length in pixels, not -1.0'),
         (
             {'principal_distance': float('nan')},
-            'principal_distance is a length in pixels, not nan',
+            'principal_distance must be a length in pixels, not nan',
         ),
     ],
 )

@@ -54,7 +54,7 @@ def test_launch(run, path):
 @pytest.mark.parametrize(
     'arguments, sentence',
     [
-        (['rig:=RIG'], 'RIG, key angle_joint: a joint, such as "carm"'),
+        (['rig:=RIG'], 'RIG, key angle_joint: expected a joint, such as "carm"'),
         (['rviz:=true'], 'rviz:=true, but rviz2 is not installed'),
         (['simulate:=true', 'rate:=abc'], 'rate:=abc is not a number'),
         (['fluoroscopes:=[a'], 'fluoroscopes:=[a is not YAML'),

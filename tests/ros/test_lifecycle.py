@@ -104,7 +104,7 @@ def test_paused_calibration_node_keeps_what_it_has(graph, exposures, tmp_path):
     publish(0)
     client.wait_for_status(lambda s: s.exposures == 1)
     assert not set_parameter('phantom', 'other.csv').successful
-    assert 'is one of still, request' in set_parameter('collect', 'luck').reason
+    assert 'must be one of still, request' in set_parameter('collect', 'luck').reason
     assert set_parameter('collect', 'request').successful
     publish(1)
     client.wait_for_status(lambda s: s.frames_received == 2)

@@ -364,8 +364,8 @@ def test_cancelled_healing_changes_nothing_and_a_second_one_is_refused(rig):
 @pytest.mark.parametrize(
     'fields, message',
     [
-        ({'seconds': -1.0}, 'seconds is above 0 and at most 60, not -1'),
-        ({'seconds': float('nan')}, 'seconds is above 0 and at most 60, not nan'),
+        ({'seconds': -1.0}, 'seconds must be above 0 and at most 60, not -1'),
+        ({'seconds': float('nan')}, 'seconds must be above 0 and at most 60, not nan'),
         ({'seconds': 0.2}, 'no frame with a marker of a body came within 0.2 s'),
     ],
 )

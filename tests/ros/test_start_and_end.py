@@ -90,13 +90,17 @@ PHANTOM = {'phantom': BAGS / 'phantom.csv'}
         (
             'calibration_node',
             {'phantom': BAGS / 'phantom.csv', 'model': 'spline'},
-            'model is one of',
+            'model must be one of',
         ),
-        ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'pair_by': 'luck'}, 'pair_by is'),
+        (
+            'calibration_node',
+            {'phantom': BAGS / 'phantom.csv', 'pair_by': 'luck'},
+            'pair_by must be',
+        ),
         (
             'calibration_node',
             {'phantom': BAGS / 'phantom.csv', 'still_px': -1.0},
-            'parameter still_px is between',
+            'parameter still_px must be between',
         ),
         (
             'calibration_node',
@@ -170,7 +174,7 @@ PHANTOM = {'phantom': BAGS / 'phantom.csv'}
         (
             'player_node',
             {'bag': BAGS / 'calibration', 'rate': 'fast'},
-            "parameter rate is a number, not 'fast'",
+            "parameter rate must be a number, not 'fast'",
         ),
         (
             'player_node',
@@ -305,7 +309,7 @@ def test_impossible_requests_are_answered(graph, tmp_path):
         answer = client.call(Capture, 'capture', timeout_sec=seconds)
         assert (
             not answer.success
-            and 'timeout_sec is a time in seconds, at most 86400, not' in answer.message
+            and 'timeout_sec must be a time in seconds, at most 86400, not' in answer.message
         )
         assert not client.call(Orient, 'orient', timeout_sec=seconds).success
     for kind, service in (

@@ -101,8 +101,7 @@ def channels_of_file(path: str) -> list[ChannelInfo]:
             counts = scan.counts
         if len(channels) > MAX_TOPICS:
             raise DataError(
-                f'{path}: the bag has {len(channels)} channels, more than {MAX_TOPICS} are not '
-                'read'
+                f'{path}: the bag has {len(channels)} channels; the limit is {MAX_TOPICS}'
             )
         return [
             ChannelInfo(channel, schemas.get(channel.schema_id), counts.get(number, 0))
@@ -183,8 +182,8 @@ def _check_chunks(file: BinaryIO) -> None:
                     chunk_size = max(chunk_size, zstandard.frame_content_size(head[start:]))
             if chunk_size > MAX_CHUNK:
                 raise DataError(
-                    f'{file.name}: a chunk of the bag takes {chunk_size / 1e6:.0f} MB, more than '
-                    f'{MAX_CHUNK / 1e6:.0f} MB are not read'
+                    f'{file.name}: a chunk of the bag takes {chunk_size / 1e6:.0f} MB; the limit '
+                    f'is {MAX_CHUNK / 1e6:.0f} MB'
                 )
         elif opcode == Opcode.DATA_END:
             break
@@ -378,7 +377,7 @@ def channels_of_bag(source: PathLike) -> list[ChannelInfo]:
         for number, connection in enumerate(bag.connections, 1):
             text = connection.msgdef.data
             if not all(isinstance(v, str) for v in (connection.topic, connection.msgtype, text)):
-                raise DataError(f'{source}: the bag is damaged, the name of a topic is no text')
+                raise DataError(f'{source}: the bag is damaged, the name of a topic is not a text')
             metadata = {'topic_type_hash': connection.digest or ''}
             profiles = getattr(connection.ext, 'offered_qos_profiles', '')
             metadata['offered_qos_profiles'] = (

@@ -86,8 +86,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         with ErrorsAt(where):
             if len(message.data) > MAX_OBSERVATIONS:
                 raise DataError(
-                    f'the message has {len(message.data)} bytes, more than {MAX_OBSERVATIONS} '
-                    'are not read'
+                    f'the message has {len(message.data)} bytes; the limit is {MAX_OBSERVATIONS}'
                 )
             frame = frame_from_message(from_cdr(message.data, TARGET_OBSERVATIONS), name)
             if validate:
@@ -108,8 +107,8 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         frames, step = _renumbered(frames, segments)
         counts = ', '.join(f'{name} {count}' for name, count in restarts.items() if count)
         notes.append(
-            f'{source}: the frame numbers begin again ({counts} times), '
-            f'{step} is added to those that follow each time'
+            f'{source}: the frame numbers restart ({counts} times), {step} is added to those '
+            'after each restart'
         )
     frames, count = _without_retracted(source, frames)
     if count:
@@ -325,14 +324,14 @@ def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
 def _pixels(message: Any) -> np.ndarray:
     """Return the grey values (h, w) of an Image. Raises DataError."""
     if message.encoding not in PIXEL_TYPES:
-        raise DataError(f'the encoding {message.encoding} is none of {", ".join(PIXEL_TYPES)}')
+        raise DataError(f'the encoding {message.encoding} is not one of {", ".join(PIXEL_TYPES)}')
     order = '>' if message.is_bigendian else '<'
     dtype = np.dtype(order + PIXEL_TYPES[message.encoding])
     if message.step < message.width * dtype.itemsize:
         raise DataError(f'a row has {message.step} bytes, too few for {message.width} px')
     data = np.asarray(message.data, dtype=np.uint8)
     if len(data) < message.step * message.height:
-        raise DataError('the image has fewer pixels than it says')
+        raise DataError('the image has fewer pixels than its header states')
     rows = data[: message.step * message.height].reshape(message.height, message.step)
     grey = np.ascontiguousarray(rows[:, : message.width * dtype.itemsize]).view(dtype)
     return grey.astype(dtype.newbyteorder('='), copy=False)
@@ -382,7 +381,7 @@ def angles_in(source: PathLike, fluoroscopes: Iterable[str], options: AngleOptio
         if angles.joints:
             _read_states(source, angles)
     except DataError as error:
-        hint = "; the joint is that of rig.toml, --angle-joint '' leaves it out"
+        hint = "; the joint is from rig.toml, --angle-joint '' disables it"
         raise DataError(f'{error}{hint if options.of_rig else ""}') from None
     return angles
 

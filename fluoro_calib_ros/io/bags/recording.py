@@ -59,11 +59,11 @@ class PlayingOptions:
     """Options for playing a bag."""
 
     rate: float = option(1.0, 'speed relative to the recording', minimum=0.001, maximum=1e6)
-    loop: bool = option(False, 'whether the bag is played over and over')
+    loop: bool = option(False, 'whether the bag is played repeatedly')
     start_offset: float = option(
         0.0,
-        'time after the first message at which playing begins; latched messages before are given '
-        'first',
+        'time after the first message at which playing begins; earlier latched messages are '
+        'published first',
         minimum=0.0,
         maximum=1e9,
         unit='s',

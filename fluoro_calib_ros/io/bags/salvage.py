@@ -114,7 +114,7 @@ class FileSalvage:
         size = len(data)
         position = len(MAGIC)
         if data[:position] != MAGIC:
-            self._note('the beginning is no MCAP file')
+            self._note('the beginning is not an MCAP file')
             position = self._next_chunk(data, 0)
         while position < size and not self._has_end:
             end = self._end_of_record(data, position)
@@ -381,7 +381,7 @@ def recover_bag(source: PathLike, out: PathLike) -> Recovery:
     """
     salvage = Salvage(source)
     if os.path.realpath(out).startswith(os.path.join(os.path.realpath(source), '')):
-        raise DataError(f'{out}: the output lies in the input {source}, choose another output')
+        raise DataError(f'{out}: the output is inside the input {source}, choose another output')
     counts: Counter[str] = Counter()
     skipped: dict[str, str] = {}
     with BagWriter(out) as bag:
@@ -595,7 +595,7 @@ def _faults(report: TopicReport) -> list[str]:
     if report.repeated_frames:
         faults.append(f'{report.repeated_frames} frame numbers are repeated')
     if report.restarts:
-        faults.append(f'the frame numbers begin again {_times(report.restarts)}')
+        faults.append(f'the frame numbers restart {_times(report.restarts)}')
     if report.undecodable:
         faults.append(f'{report.undecodable} messages are too short for their type')
     return faults

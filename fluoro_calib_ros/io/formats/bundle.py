@@ -101,7 +101,7 @@ def _cameras(rows: Mapping[str, Sequence[Row]], settings: FileSettings) -> _Came
         if len(numbers) > 1:
             raise DataError(
                 f'{rows[".pho"][0].path}: there are {len(numbers)} cameras, and without the .eop '
-                'file nothing says which station belongs to which'
+                'file their stations are unknown'
             )
         camera_of_station = {row.whole(1, 'the station'): numbers[0] for row in rows['.pho']}
     names = {number: f'cam{number}' for number in numbers}
@@ -156,7 +156,7 @@ def _frame(rows: Sequence[Row], name: str, exposure: int, size: tuple[int, int])
     on_image = points_on_image(uv, size)
     if not on_image.all():
         rows[int(np.argmin(on_image))].fail(
-            f'the point is off the image of {size[0]} x {size[1]} px; y is negative downwards'
+            f'the point is outside the image of {size[0]} x {size[1]} px; y is negative downwards'
         )
     if not (values[:, 2:4] > 0).all():
         rows[int(np.argmin((values[:, 2:4] > 0).all(axis=1)))].fail('the noise is not above 0')
@@ -225,9 +225,9 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     )
     if len(observations) > 1 and not content.stations:
         raise DataError(
-            f'{path}: image points of {", ".join(observations)} need the exterior orientations of '
-            'the .eop file, which say what station belongs to which: convert a result folder, or '
-            'choose one with --fluoroscopes'
+            f'{path}: image points of {", ".join(observations)} need the exterior orientations '
+            'of the .eop file, which assign the stations: convert a result folder, or choose one '
+            'with --fluoroscopes'
         )
     numbering = _Numbering(names, content)
     texts = {

@@ -263,17 +263,20 @@ class FileSettings:
         """Return the unit in mm for a file that does not state it. Raises DataError if not set."""
         if self.units is None:
             raise DataError(
-                f'{where}: this format does not say the unit of its lengths, --units '
+                f'{where}: this format does not state the unit of its lengths, --units '
                 f'{"|".join(UNITS_MM)} is needed'
             )
         return UNITS_MM[self.units]
 
-    def unit_or(self, default: str, what: str) -> tuple[float, tuple[str, ...]]:
+    def unit_or(self, default: str, subject: str) -> tuple[float, tuple[str, ...]]:
         """Return the unit in mm, and a note if it is the default of the format."""
         if self.units is not None:
             return UNITS_MM[self.units], ()
-        note = f'{what}: lengths in {default}, as the format does not say a unit; change it with '
-        return UNITS_MM[default], (note + '--units',)
+        note = (
+            f'{subject}: lengths in {default}, as the format does not state a unit; change it '
+            'with --units'
+        )
+        return UNITS_MM[default], (note,)
 
 
 @dataclass(frozen=True)

@@ -279,7 +279,7 @@ def read_known_orientations(path: PathLike) -> dict[str, KnownOrientation]:
     version = document.get('format_version', VERSION)
     if version != VERSION:
         raise DataError(
-            f'{path}: the file has layout version {version}, this program knows version {VERSION}'
+            f'{path}: the file has layout version {version}, this program reads version {VERSION}'
         )
     return {
         str(name): _orientation(entry, f'{path}, fluoroscope {name}')

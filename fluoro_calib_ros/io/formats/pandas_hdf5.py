@@ -46,7 +46,7 @@ def table_arrays(group: Any) -> dict[str, Any]:
     else:
         raise ValueError(f'it is a {kind} of pandas, not a table')
     if columns.ndim != 2 or values.shape != (len(index), len(columns)):
-        raise ValueError('its columns have not several headers each, and numbers of one kind')
+        raise ValueError('its columns need several headers each, and numbers of one kind')
     return {'columns': columns, 'index': index, 'values': values}
 
 

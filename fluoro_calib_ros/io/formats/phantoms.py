@@ -157,9 +157,7 @@ def _unit(path: Path, layout: _Layout, settings: FileSettings) -> float:
     if layout.unit is None:
         return settings.unit_read(path)
     if settings.units not in (None, layout.unit):
-        raise DataError(
-            f'{path}: the header says {layout.unit}, but --units says {settings.units}'
-        )
+        raise DataError(f'{path}: the header has {layout.unit}, but --units is {settings.units}')
     return UNITS_MM[layout.unit]
 
 

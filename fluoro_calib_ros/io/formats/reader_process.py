@@ -105,8 +105,8 @@ def sleap_arrays(path: str) -> dict[str, Any]:
     with h5py.File(path, 'r') as file:
         if 'tracks' not in file or 'node_names' not in file:
             raise ValueError(
-                'it is no analysis file of SLEAP, which has tracks and node_names; of a project, '
-                'export the analysis HDF5'
+                'it is not an analysis file of SLEAP, which has tracks and node_names; of a '
+                'project, export the analysis HDF5'
             )
         tracks = file['tracks']
         axes = list(json.loads(tracks.attrs['dims']) if 'dims' in tracks.attrs else SLEAP_AXES)
@@ -131,7 +131,7 @@ def deeplabcut_arrays(path: str) -> dict[str, Any]:
     with h5py.File(path, 'r') as file:
         tables = [group for group in file.values() if is_pandas(group)]
         if len(tables) != 1:
-            raise ValueError('it is no file of DeepLabCut, which has one table of pandas')
+            raise ValueError('it is not a file of DeepLabCut, which has one table of pandas')
         return table_arrays(tables[0])
 
 

@@ -151,7 +151,7 @@ def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Cont
     for path, (_, content) in contents.items():
         for name, frames in (content.observations or {}).items():
             if name in observations:
-                raise DataError(f'{path}: another file is of fluoroscope {name}, too')
+                raise DataError(f'{path}: another file is also of fluoroscope {name}')
             observations[name] = frames
     names = {
         name: i for _, content in contents.values() for name, i in content.names.targets.items()

@@ -59,7 +59,7 @@ def frame_of(
     if not on_image.all():
         u, v = uv[np.argmin(on_image)]
         raise DataError(
-            f'{where}: the point ({u:g}, {v:g}) is off the image of {image_size[0]} x '
+            f'{where}: the point ({u:g}, {v:g}) is outside the image of {image_size[0]} x '
             f'{image_size[1]} px'
         )
     return Frame(fluoroscope, number, target_id, uv, image_size, frame_id=f'{fluoroscope}_optical')
@@ -105,11 +105,11 @@ class Row:
             values.append(value)
         return values
 
-    def whole(self, column: int, what: str) -> int:
+    def whole(self, column: int, label: str) -> int:
         """Return a cell as a non-negative integer. Raises DataError."""
         cell = self.cells[column]
         if not cell.isascii() or not cell.isdigit():
-            self.fail(f'{what} is {quoted(cell)}, not a whole number')
+            self.fail(f'{label} is {quoted(cell)}, not an integer')
         return int(cell)
 
 
@@ -174,11 +174,11 @@ def frame_numbers(rows: Sequence[Row], first: int) -> list[int]:
     return [row.whole(0, 'Frame') if first else number for number, row in enumerate(rows, 1)]
 
 
-def require_width(rows: Iterable[Row], width: int, what: str) -> None:
+def require_width(rows: Iterable[Row], width: int, label: str) -> None:
     """Raise DataError for the first row that does not have `width` cells."""
     for row in rows:
         if len(row.cells) != width:
-            row.fail(f'{len(row.cells)} columns, but {what} has {width}')
+            row.fail(f'{len(row.cells)} columns, but {label} has {width}')
 
 
 def number_text(value: float) -> str:

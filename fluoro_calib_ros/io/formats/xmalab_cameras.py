@@ -69,7 +69,7 @@ def _read_mayacam2(path: Path, settings: FileSettings) -> Content:
     for number, title in _TITLES.items():
         if _line(path, lines, number).strip() != title:
             raise DataError(
-                f'{path}, row {number}: {quoted(_line(path, lines, number))} stands where MayaCam '
+                f'{path}, row {number}: {quoted(_line(path, lines, number))} is where MayaCam '
                 f'2.0 has the line {title!r}'
             )
     width, height = _numbers(path, lines, 2, 2)
@@ -237,7 +237,10 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
             cameras.append(_dlt_camera(name, to_pixels @ projection, size, mm))
         except ValueError as error:
             raise DataError(f'{path}, {name}: {error}') from None
-    note = f'{path}: rows count downwards, as in DLTdv8, or the origin would be behind the cameras'
+    note = (
+        f'{path}: rows are counted downwards, as in DLTdv8: otherwise the origin would be behind '
+        'the cameras'
+    )
     return Content(cameras=tuple(cameras), notes=(note,) if downwards else ())
 
 

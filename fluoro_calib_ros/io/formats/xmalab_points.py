@@ -76,8 +76,12 @@ def _origin_notes(path: Path, header: Row, settings: FileSettings) -> tuple[str,
         return ()
     last_column = header.cells[-1]
     if re.fullmatch(r'pt\d+_cam\d+_Y', last_column):
-        return (f'{path}: of DLTdv8, add --one-based; of DLTdv5 to 7, --one-based --y-up',)
-    return (f'{path}: of Argus, add --y-up',) if re.search(r'_cam_\d+_y$', last_column) else ()
+        return (f'{path}: for files of DLTdv8 add --one-based, of DLTdv5 to 7 --one-based --y-up',)
+    return (
+        (f'{path}: for files of Argus add --y-up',)
+        if re.search(r'_cam_\d+_y$', last_column)
+        else ()
+    )
 
 
 def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:
@@ -121,7 +125,7 @@ def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
 def _check_offsets(row: Row, first: int, offsets: int) -> None:
     """Raise DataError for cameras with a time offset, which DLTdv allows."""
     if offsets and any(Row(row.path, row.line, row.cells[first : first + offsets]).numbers()):
-        row.fail('the cameras are offset against each other in time: write them without offset')
+        row.fail('the cameras are offset against each other in time: export them without offset')
 
 
 def _pixels(
@@ -146,8 +150,8 @@ def _check_point(
         index = int(np.argmax(is_off_image))
         target, camera = header[2 * index]
         row.fail(
-            f'the point ({uv[index, 0]:g}, {uv[index, 1]:g}) of {target} in cam{camera} is off '
-            f'the image of {size[0]} x {size[1]} px'
+            f'the point ({uv[index, 0]:g}, {uv[index, 1]:g}) of {target} in cam{camera} is '
+            f'outside the image of {size[0]} x {size[1]} px'
         )
 
 

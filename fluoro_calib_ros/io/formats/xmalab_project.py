@@ -433,8 +433,7 @@ class ProjectArchive:
         text = self.text(element, name)
         if not text.isascii() or not text.isdigit():
             raise DataError(
-                f'{self.path}, {DOCUMENT}: {name} of a {element.tag} is {text!r}, not a whole '
-                'number'
+                f'{self.path}, {DOCUMENT}: {name} of a {element.tag} is {text!r}, not an integer'
             )
         return int(text)
 

@@ -20,7 +20,9 @@ from rclpy.task import Future
 from ..messages.self_calibration import feedback_text, healing_text
 from .state import CALIBRATE, CALIBRATE_FAST, HEAL, Diagnosis
 
-NO_ANSWER = 'no answer yet; it may be lost: look at the state of the rig before you ask again'
+NO_ANSWER = (
+    'no answer yet; it may be lost: check the state of the rig before you repeat the request'
+)
 
 
 class _Kind(NamedTuple):
@@ -110,7 +112,7 @@ class Actions:
     def _on_goal(self, kind: _Kind, future: Future) -> None:
         handle = future.result()
         if not handle.accepted:
-            self._end(f'{kind.name}: refused, the calibration node does something else')
+            self._end(f'{kind.name}: refused, the calibration node is busy')
             return
         with self._lock:
             self._goal = handle

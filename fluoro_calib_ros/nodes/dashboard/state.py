@@ -182,6 +182,8 @@ def light(state: SessionState) -> Light:
     if doubtful:
         return Light('warn', 'Attention', f'{doubtful[0].name}: {doubtful[0].message}')
     if state.verdict == 'cannot tell':
-        return Light('warn', 'Attention', 'it cannot be told whether the calibration is good')
+        return Light(
+            'warn', 'Attention', 'the checks cannot decide whether the calibration is good'
+        )
     drift = f'; drift: {state.drift}' if state.drift else ''
     return Light('ok', 'OK', f'calibrated{drift}')

@@ -286,7 +286,7 @@ class SessionClient(Node):
         for node, functions in sorted(self._functions.items()):
             silent_s = now - self._heard_at[node]
             if silent_s > SILENT_S:
-                yield NodeState(node, 'silent', f'nothing heard for {silent_s:.0f} s')
+                yield NodeState(node, 'silent', f'no message for {silent_s:.0f} s')
                 continue
             worst = max(functions.values(), key=lambda f: LEVELS.index(f.level))
             several = len(functions) > 1 and worst.level != 'ok'
@@ -338,7 +338,7 @@ def main(args: Sequence[str] | None = None) -> None:
     options, ros_arguments = parser.parse_known_args(args)
     is_terminal = sys.stdin.isatty() and sys.stdout.isatty()
     if not options.once and not options.web and not is_terminal:
-        sys.exit('fluoro-calib watch: this is no terminal; with --once the state is only printed')
+        sys.exit('fluoro-calib watch: this is not a terminal; use --once to print the state')
     with session_client(ros_arguments) as client:
         if options.once:
             _print(client)

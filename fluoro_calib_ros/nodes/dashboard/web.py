@@ -103,16 +103,18 @@ class Handler(RequestHandler):
         elif self.request.method != 'GET':
             origin = f'{self.request.protocol}://{self.request.host}'
             if self.request.headers.get('Origin') != origin:
-                raise HTTPError(403, reason='Forbidden', log_message='another page has asked')
+                raise HTTPError(
+                    403, reason='Forbidden', log_message='the request comes from another page'
+                )
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Answer with one sentence."""
         error = kwargs.get('exc_info', (None, None, None))[1]
         self.set_header('Content-Type', 'text/plain; charset=utf-8')
-        self.finish(str(getattr(error, 'log_message', None) or 'this cannot be answered'))
+        self.finish(str(getattr(error, 'log_message', None) or 'the request cannot be answered'))
 
-    def _is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self._desk.options.token.encode())
+    def _is_token(self, text: str) -> bool:
+        return hmac.compare_digest(text.encode(), self._desk.options.token.encode())
 
     def _finish_json(self, value: dict[str, Any]) -> None:
         self.finish(to_json_values(value))

@@ -39,7 +39,7 @@ UINT32 = Struct('<I')
 TWO_UINT32 = Struct('<II')
 TIME = Struct('<iI')
 _HEADER = Struct('<iII')  # seconds, nanoseconds, length of the frame id
-TRUNCATED = 'the message is shorter than it says'
+TRUNCATED = 'the message is shorter than its header states'
 
 
 def as_little_endian(data: bytes, kind: type) -> bytes:

@@ -163,7 +163,7 @@ def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
     count = len(message.fluoroscope)
     limit = read_limits().max_fluoroscopes
     if count > limit:
-        raise DataError(f'rig orientation: {count} fluoroscopes, more than {limit} are not read')
+        raise DataError(f'rig orientation: {count} fluoroscopes; the limit is {limit}')
     if not count:
         raise DataError('rig orientation: it has no fluoroscopes')
     columns = {

@@ -35,7 +35,7 @@ def options_of_request(
     """
     if request.principal_distance < 0 or not np.isfinite(request.principal_distance):
         raise ValueError(
-            f'principal_distance is a length in pixels, not {request.principal_distance}'
+            f'principal_distance must be a length in pixels, not {request.principal_distance}'
         )
     requested = {name: getattr(request, name) or getattr(defaults, name) for name in _REQUESTED}
     if not joint:

@@ -335,7 +335,10 @@ class Status:
     values: Mapping[str, object] = field(default_factory=dict)
 
 
-NO_CLOCK = 'use_sim_time is set, but nobody publishes /clock: what this node stamps has the time 0'
+NO_CLOCK = (
+    'use_sim_time is set, but nobody publishes /clock: this node stamps its messages with the '
+    'time 0'
+)
 
 
 class DiagnosticsPublisher:

@@ -192,7 +192,7 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
         if select.select([reading], [], [], patience - ONE_INTERRUPT_S)[0]:
             os._exit(128 + signal.SIGINT)  # exit status of shells for this signal
         rclpy.logging.get_logger('fluoro_calib').fatal(
-            f'ended by force: the work in hand takes longer than {patience:g} s'
+            f'ended by force: the current work takes longer than {patience:g} s'
         )
         os._exit(1)
 

@@ -273,23 +273,23 @@ def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -
 # Name of a value in messages, by the type of the default.
 _WORDS = {
     bool: 'true or false',
-    int: 'a whole number',
+    int: 'an integer',
     float: 'a number',
     str: 'a text',
-    tuple: 'a list of texts, such as [a, b]',
+    tuple: 'a list of strings, such as [a, b]',
 }
 
 
-def _check_given(declaration: Option, given: Parameter) -> None:
+def _check_given(declaration: Option, parameter: Parameter) -> None:
     """Raise StartError for a value that is invalid for a parameter, in the words of its option."""
-    default = declaration.default
+    name, default = declaration.name, declaration.default
     listed = list(default) if isinstance(default, tuple) else default
-    empty = given.type_ == Parameter.Type.NOT_SET or given.value == []  # of any type
-    if not empty and given.type_ != Parameter.Type.from_parameter_value(listed):
-        value = printable(shortened(repr(given.value)))
-        raise StartError(f'parameter {declaration.name} is {_WORDS[type(default)]}, not {value}')
+    empty = parameter.type_ == Parameter.Type.NOT_SET or parameter.value == []  # of any type
+    if not empty and parameter.type_ != Parameter.Type.from_parameter_value(listed):
+        value = printable(shortened(repr(parameter.value)))
+        raise StartError(f'parameter {name} must be {_WORDS[type(default)]}, not {value}')
     try:
-        declaration.validate(_tuple_or_value(declaration, given.value))
+        declaration.validate(_tuple_or_value(declaration, parameter.value))
     except ValueError as error:
         raise StartError(f'parameter {error}') from None
 
@@ -388,7 +388,7 @@ def check_timeout(seconds: float) -> None:
     """Raise ValueError for a time that a node cannot wait."""
     if not 0 < seconds <= MAX_TIMEOUT_S:
         limit = f', at most {MAX_TIMEOUT_S:g}' if seconds > MAX_TIMEOUT_S else ''
-        raise ValueError(f'timeout_sec is a time in seconds{limit}, not {seconds}')
+        raise ValueError(f'timeout_sec must be a time in seconds{limit}, not {seconds}')
 
 
 def expand_path(text: str) -> Path:

@@ -74,8 +74,8 @@ def needs_best_effort(node: Node, subscription: Subscription) -> bool:
 def best_effort_message(topic: str) -> str:
     """Return the message about a topic that is from now on subscribed to as best effort."""
     return (
-        f'topic {topic}: its publishers offer best effort only; it is subscribed best effort now, '
-        'so lost messages are not sent again'
+        f'topic {topic}: its publishers offer best effort only; the subscription is now best '
+        'effort, so lost messages are not sent again'
     )
 
 
@@ -119,7 +119,7 @@ def publisher_conflict(node: Node, topic: str) -> str:
     )
     return (
         f'{len(publishers)} nodes publish {topic} ({", ".join(names)}): no new calibration is '
-        'used until only one is left'
+        'used until only one remains'
     )
 
 

@@ -17,24 +17,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from .background import TERMS
 from .light import Noise
 from .marker_intensity import LightWindows, Shadows
 from .marker_motion import SHADOW_SD_PX, MarkerStates, MeasuredMarkers, Motion, assign
+from .profile import Profile
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
-    DTYPE,
     MARGIN_PX,
     MAX_SIGMA_PX,
     MIN_PASSED,
-    TERMS,
     Beads,
     FineGrid,
     FitSettings,
     NormalEquations,
-    Profile,
     ShadowFit,
 )
+from .texture import DTYPE
 
 SETTINGS = FitSettings(
     steps=3,  # for markers whose shadows touch
@@ -149,7 +149,7 @@ class _MarkerFit(ShadowFit):
         moved = np.abs(uv - self.uv[rows]).max(axis=1)
         self.uv[rows] = uv
         self.depth[rows] = depth
-        self.background[rows] = background
+        self.background.terms[rows] = background
         return np.asarray(moved)
 
     def _shadow(
@@ -188,7 +188,7 @@ class _MarkerFit(ShadowFit):
         """Return light (g, m) and its derivatives (g, OWN + 3 k, m)."""
         members = np.concatenate([rows[:, None], near], axis=1)
         shadow, by_u, by_v = self._shadow(members, self.middle[rows])
-        direct = self._direct(rows)
+        direct = self.background.direct(rows)
         if not near.shape[1]:  # the same in fewer operations
             depth = self.depth[rows, None]
             behind = direct * np.maximum(1 - depth * shadow[:, 0], MIN_PASSED)

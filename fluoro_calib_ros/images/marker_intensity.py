@@ -32,7 +32,7 @@ from .detection import (
 from .light import Light, Noise, estimate_noise, vertex
 from .marker_motion import GIVEN_GATE, GIVEN_SD_PX, MarkerStates, Motion, assign
 from .measurement import circles, estimate_profile
-from .shadow_fit import Profile
+from .profile import Profile
 
 MARKER_SCALES = SCALES[:5]  # markers are smaller than beads
 MIN_CONTRAST = 0.02  # least response, as a fraction of the light around it

@@ -16,30 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .background import PLANE_TERMS, TERMS
 from .detection import LARGER
 from .light import Light, Noise, less_common, vertex
+from .profile import HIGH, LOW, Absorbed, Profile, Shadows, fit_profile
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
-    DTYPE,
-    HIGH,
-    LOW,
     MARGIN_PX,
     MIN_INSIDE,
     MIN_PASSED,
-    PLANE_TERMS,
-    TERMS,
     UNDISTURBED,
-    Absorbed,
     Beads,
     FineGrid,
     FitSettings,
     NormalEquations,
-    Profile,
     ShadowFit,
-    Shadows,
-    fit_profile,
 )
+from .texture import DTYPE
 
 SETTINGS = FitSettings(
     steps=5,
@@ -144,7 +138,7 @@ def _profile_fit(
     noise = Noise(0.0, 1.0, np.ones((1, 1)))
     shape, size = shapes
     fit = _BeadFit(light, uv, shape, profile=profile, noise=noise, size=size, reach_px=reach_px)
-    fit.plane_only = True
+    fit.background.plane_only = True
     fit.run(PROFILE_STEPS)
     return fit
 
@@ -259,12 +253,12 @@ class _BeadFit(ShadowFit):
                 kept = rows[~lost]
                 self.uv[kept] = uv[~lost]
                 self.depth[kept] = depth[~lost]
-                self.background[kept] = background[~lost]
+                self.background.terms[kept] = background[~lost]
             if step == steps // 2:
                 self.disturbed = self.misfit > DISTURBED * self.typical()
                 if steps >= STEPS:
                     self._add_texture()
-                active |= self.disturbed | (self.strength > 0)
+                active |= self.disturbed | (self.texture.strength > 0)
 
     def _cross(self) -> NDArray[np.bool_]:
         """Compute how shadows that touch differ from the product of both shadows.
@@ -343,7 +337,7 @@ class _BeadFit(ShadowFit):
         depth = self.depth[everyone].astype(np.float32)[..., None]
         passed = np.maximum(1 - depth * shadow, np.float32(MIN_PASSED))
         product = np.prod(passed, axis=1)
-        direct = self._direct(rows)
+        direct = self.background.direct(rows)
         behind = direct * (product + self._crossing_in(rows))
         by_shadow = (-direct * product)[:, None] / passed
         by_distance = -by_shadow * depth * slope
@@ -363,7 +357,7 @@ class _BeadFit(ShadowFit):
 
     def _prior(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.float64]:
         prior = super()._prior(rows, near)
-        if self.plane_only:
+        if self.background.plane_only:
             prior[:, PLANE_TERMS:TERMS] = HELD
         return prior
 
@@ -407,7 +401,7 @@ class _BeadFit(ShadowFit):
     def absorbed(self) -> Absorbed:
         """Return the light absorbed by beads, in the pixels of beads with a good fit."""
         every = np.arange(len(self.uv))
-        plane = self._direct(every) + self._scattered(every)
+        plane = self.background.direct(every) + self._scattered(every)
         x, y = np.moveaxis(self.middle[:, None] + self.offset - self.uv[:, None], 2, 0)
         distance = np.sqrt(self._squared(every, x, y))
         known = self.valid & (self.grey > self.low) & (self.grey < self.high)
@@ -417,7 +411,7 @@ class _BeadFit(ShadowFit):
         weight = plane / np.maximum(np.median(plane), 1e-9)
         size = np.broadcast_to(rounded(self.size, 1 + RADIUS_SD)[:, None], good.shape)
         share = 1 - self.grey / plane
-        around = self.around[:, None] / plane
+        around = self.background.around[:, None] / plane
         return Absorbed(*(one[good] for one in (distance, share, weight, size, around)))
 
     def result(self) -> Beads:
@@ -436,11 +430,13 @@ class _BeadFit(ShadowFit):
         If shadows are not exactly those of spheres, residuals are alike in all windows. Such
         residuals are not noise and shift no centre relative to the others.
         """
-        usual = measured & (self.strength == 0) & (self.misfit <= DISTURBED * self.typical())
+        usual = (
+            measured & (self.texture.strength == 0) & (self.misfit <= DISTURBED * self.typical())
+        )
         rest = less_common(self.uv, self.radius, self.residual, self.counted, usual)
         whole = (self.residual**2 * self.counted).sum(axis=1)
         share = np.minimum((rest**2).sum(axis=1) / np.maximum(whole, 1e-12), 1.0)
-        return np.where(self.strength > 0, 1.0, share) * self.misfit
+        return np.where(self.texture.strength > 0, 1.0, share) * self.misfit
 
     def _is_light_clipped(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return (g,) whether nearly all pixels outside the shadows of windows are clipped."""
@@ -628,10 +624,10 @@ def _by_scatter(
     both x.
     """
     depth = fit.depth[np.concatenate([rows[:, None], near], axis=1)][..., None]
-    direct = fit._direct(rows)
+    direct = fit.background.direct(rows)
     passed = (light - fit._scattered(rows)) / direct
     by_depth = (depth * jacobian[:, TERMS + 2 :: 3]).sum(axis=1) / direct
-    return fit.around[rows, None] * (1 + 2 * fit._crossing_in(rows) - passed + by_depth)
+    return fit.background.around[rows, None] * (1 + 2 * fit._crossing_in(rows) - passed + by_depth)
 
 
 def _overlapping(

@@ -24,7 +24,7 @@ from fluoro_calib_ros.images.growth import Seen
 from fluoro_calib_ros.images.light import Light, Noise, estimate_noise
 from fluoro_calib_ros.images.matching import PhantomModel, match
 from fluoro_calib_ros.images.measurement import circles, measure_beads
-from fluoro_calib_ros.images.shadow_fit import Absorbed, Profile, fit_profile, shadow_derivatives
+from fluoro_calib_ros.images.profile import Absorbed, Profile, fit_profile, shadow_derivatives
 from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, lacks_certain_pose
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.radiographs import HARD, Radiography

@@ -31,7 +31,9 @@ from fluoro_calib_ros.images.markers import FirstMarkers, MarkerTracker
 from fluoro_calib_ros.images.matching import PhantomModel
 from fluoro_calib_ros.images.measurement import circles, measure_beads
 from fluoro_calib_ros.images.pose_search import _hits, triples_of
-from fluoro_calib_ros.images.shadow_fit import FineGrid, Profile, window_offsets
+from fluoro_calib_ros.images.profile import Profile
+from fluoro_calib_ros.images.shadow_fit import FineGrid
+from fluoro_calib_ros.images.texture import window_offsets
 from fluoro_calib_ros.images.view import Lens, View
 
 RNG = np.random.default_rng(31)

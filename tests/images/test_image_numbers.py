@@ -43,7 +43,7 @@ from fluoro_calib_ros.images.marker_watch import (
     shift_together,
 )
 from fluoro_calib_ros.images.measurement import circles
-from fluoro_calib_ros.images.shadow_fit import Profile
+from fluoro_calib_ros.images.profile import Profile
 from fluoro_calib_ros.images.view import Lens, View
 
 

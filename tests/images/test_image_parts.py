@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images import matching
+from fluoro_calib_ros.images.background import TERMS
 from fluoro_calib_ros.images.growth import Match
 from fluoro_calib_ros.images.light import (
     LAGS,
@@ -40,19 +41,16 @@ from fluoro_calib_ros.images.matching import (
     seeds_of,
     unambiguous,
 )
+from fluoro_calib_ros.images.profile import Absorbed, Profile, fit_profile
 from fluoro_calib_ros.images.shadow_fit import (
     DEPTHS,
     OWN,
-    TERMS,
-    Absorbed,
     FitSettings,
-    Profile,
     ShadowFit,
     _inflation,
     _sd_of_centre,
-    fit_profile,
-    window_offsets,
 )
+from fluoro_calib_ros.images.texture import window_offsets
 from fluoro_calib_ros.images.view import (
     Lens,
     View,
@@ -281,7 +279,7 @@ class Discs(ShadowFit):
     def _model(self, rows, near):
         k = near.shape[1]
         rng = np.random.default_rng(7)
-        direct = self._direct(rows)
+        direct = self.background.direct(rows)
         jacobian = self._jacobian(rows, direct, 1 + k)
         jacobian[:, TERMS:] = rng.normal(size=jacobian[:, TERMS:].shape)
         return self._scattered(rows) + direct, jacobian
@@ -381,8 +379,9 @@ def test_steps_of_a_fit_are_those_of_weighted_least_squares(neighbours):
         right[TERMS + 2] -= prior[TERMS + 2] * 0.1
         step = np.linalg.solve(a.T @ a / 4.0 + np.diag(prior), right)
         # The unit of a step of the background is the direct light in the middle.
-        relative = step[:TERMS] / np.exp(fit.background[k, 0])
-        np.testing.assert_allclose(background[k], fit.background[k] + relative, atol=1e-5)
+        terms = fit.background.terms[k]
+        relative = step[:TERMS] / np.exp(terms[0])
+        np.testing.assert_allclose(background[k], terms + relative, atol=1e-5)
         moved = np.clip(step[TERMS : TERMS + 2], -0.5, 0.5)
         np.testing.assert_allclose(centres[k], fit.uv[k] + moved, atol=1e-3)
         assert depth[k] == pytest.approx(
@@ -403,7 +402,7 @@ def test_beads_are_grouped_by_their_neighbours_and_alone_first():
 def test_windows_begin_with_the_upper_quartile_and_need_most_of_their_pixels():
     fit = fit_of()
     for k in range(3):
-        light = np.exp(fit.background[k, 0])
+        light = np.exp(fit.background.terms[k, 0])
         assert np.mean(fit.grey[k] < light) == pytest.approx(0.75, abs=0.02)
     valid = fit.valid.copy()
     valid[1] = np.arange(len(fit.offset)) < 0.59 * len(fit.offset)

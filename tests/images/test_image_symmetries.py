@@ -26,7 +26,7 @@ from fluoro_calib_ros.images.marker_intensity import (
 )
 from fluoro_calib_ros.images.marker_motion import MarkerStates, Motion
 from fluoro_calib_ros.images.measurement import circles, measure_beads
-from fluoro_calib_ros.images.shadow_fit import Profile
+from fluoro_calib_ros.images.profile import Profile
 
 WHITE = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
 WHITE[LAGS, LAGS] = 1.0

@@ -23,7 +23,7 @@ from fluoro_calib_ros.images.measurement import (
     first_imaging,
     measure_beads,
 )
-from fluoro_calib_ros.images.shadow_fit import Profile
+from fluoro_calib_ros.images.profile import Profile
 
 FINE = 4  # grid points per pixel, along each axis
 PITCH = 60
@@ -437,8 +437,8 @@ def test_light_behind_two_beads_changes_with_the_scattered_light():
         light, shadows.uv, shadows.shape, profile, Noise(0.0, 1.0, np.ones((1, 1))), np.ones(36)
     )
     fit.run(4)
-    fit.background[:] = np.log(800.0), 0, 0, 0, 0, 0
-    fit.around[:] = 900.0
+    fit.background.terms[:] = np.log(800.0), 0, 0, 0, 0, 0
+    fit.background.around[:] = 900.0
     fit._cross()
     rows, near = (np.concatenate(parts) for parts in zip(*fit.groups[1:]))
     before, jacobian = fit._model(rows, near)
@@ -446,9 +446,9 @@ def test_light_behind_two_beads_changes_with_the_scattered_light():
     change = 1e-3
     fit.profile = replace(profile, scatter=0.2 + change)
     # The light without beads stays the same.
-    direct = np.exp(fit.background[:, 0])
-    fit.background[:, 0] = np.log(direct - change * fit.around)
-    fit.depth *= direct / (direct - change * fit.around)
+    direct = np.exp(fit.background.terms[:, 0])
+    fit.background.terms[:, 0] = np.log(direct - change * fit.background.around)
+    fit.depth *= direct / (direct - change * fit.background.around)
     fit._cross()
     after, _ = fit._model(rows, near)
     # The tolerance allows for the blur of touching shadows on three grid points per pixel.

@@ -490,13 +490,13 @@ def test_images_in_which_nothing_can_be_seen_are_refused():
 def test_a_marker_moves_by_the_larger_one_of_its_coordinates():
     fit = _MarkerFit.__new__(_MarkerFit)
     fit.uv = np.array([[1.0, 2], [3, 4], [5, 6]])
-    fit.depth, fit.background = np.zeros(3), np.zeros(3)
+    fit.depth, fit.background = np.zeros(3), Fake(terms=np.zeros(3))
     rows = np.array([2, 0])
     step = np.array([[5.1, 5.5], [1.4, 2.0]]), np.array([0.3, 0.2]), np.array([30.0, 20])
     fit._step = lambda *given: step
     np.testing.assert_allclose(fit._take_step(rows, np.zeros((2, 0)), True), [0.5, 0.4])
     np.testing.assert_array_equal(fit.uv, [[1.4, 2.0], [3, 4], [5.1, 5.5]])
-    assert fit.depth.tolist() == [0.2, 0, 0.3] and fit.background.tolist() == [20, 0, 30]
+    assert fit.depth.tolist() == [0.2, 0, 0.3] and fit.background.terms.tolist() == [20, 0, 30]
 
 
 def test_response_to_a_shadow_is_the_smaller_eigenvalue_of_the_hessian():

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.images.light import Cosines
-from fluoro_calib_ros.images.shadow_fit import window_offsets
+from fluoro_calib_ros.images.background import Background
+from fluoro_calib_ros.images.texture import Cosines, window_offsets
 
 OFFSET = window_offsets(8.0)
 COSINES = Cosines(OFFSET, np.float64)
@@ -110,3 +110,58 @@ def test_a_straight_edge_has_more_evidence_than_a_background_without_direction(d
     assert np.mean(evidence(Cosines(OFFSET, np.float64, direction)) > without) > 0.9
     # In a wrong direction it has not.
     assert np.mean(evidence(Cosines(OFFSET, np.float64, direction + 1.0)) > without) < 0.1
+
+
+# ---- backgrounds
+
+
+def test_a_large_step_is_one_of_the_light():
+    """The logarithm of a line is no line; its polynomial is the best one of degree 2."""
+    background = Background(2, OFFSET, 8.0)
+    background.start(np.array([100.0, 200.0]), np.array([50.0, 100.0]), 0.2)
+    assert background.light(0.2) == pytest.approx([100, 200])
+    assert np.allclose(background.direct(np.arange(2)).T, [90, 180], rtol=1e-5)
+    step = np.zeros((2, 6))
+    step[0, 1] = 63.0  # the light at the border changes by 70 %
+    step[1, 2] = 1.0
+    terms = background.changed(np.arange(2), step)
+    x = OFFSET[:, 0] / 8
+    slope, curvature = np.linalg.lstsq(
+        np.stack([x, x * x, np.ones_like(x), OFFSET[:, 1] ** 2], axis=1), np.log(1 + 0.7 * x)
+    )[0][:2]
+    assert terms[0, [1, 3]] == pytest.approx([slope, curvature], abs=1e-3)
+    assert terms[1] == pytest.approx([np.log(180), 0, 1 / 180, 0, 0, 0])
+
+
+def test_direct_light_is_at_least_a_tenth_in_the_dark():
+    background = Background(1, OFFSET, 8.0)
+    background.start(np.array([10.0]), np.array([500.0]), 0.1)
+    assert np.exp(background.terms[0, 0]) == pytest.approx(1.0)
+    assert background.light(0.1) == pytest.approx([10.0])
+
+
+def test_blur_draws_a_shadow_towards_less_light():
+    """Compare with a shadow in an exponential background that is blurred numerically."""
+    axis = np.arange(-400, 401) / 20
+    slope = 0.08
+    light = np.exp(slope * axis) * (1 - 0.5 * (np.abs(axis) < 3))
+    kernel = np.exp(-0.5 * (axis / 1.5) ** 2)
+    blurred = np.convolve(light, kernel / kernel.sum(), mode='same')
+    inside = np.abs(axis) < 8
+    shadow = 1 - blurred[inside] / np.exp(slope * axis[inside] + 0.5 * slope**2 * 1.5**2)
+    seen = (shadow * axis[inside]).sum() / shadow.sum()
+    background = Background(1, OFFSET, 8.0)
+    background.terms[0, 1] = slope * 8
+    drawn = background.drawn(np.zeros((1, 2)), 1.5**2)
+    assert drawn[0] == pytest.approx([-seen, 0], abs=2e-3)
+    assert seen == pytest.approx(-slope * 1.5**2, abs=2e-3)
+
+
+@pytest.mark.parametrize('angle', [-1.2, 0.3, 1.0])
+def test_light_changes_most_across_an_edge_whether_it_slopes_or_bends(angle):
+    background = Background(2, OFFSET, 8.0)
+    a, b = np.cos(angle), np.sin(angle)
+    background.terms[0, 1:3] = 0.4 * a, 0.4 * b
+    background.terms[1, 3:] = a * a, 2 * a * b, b * b
+    found = background.steepest(np.arange(2))
+    assert np.abs(np.sin(found - angle)).max() < 1e-9

@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Light of windows without beads: direct light, and scattered light that is not attenuated.
+
+Plates and bones attenuate direct light exponentially, so its logarithm is a polynomial. Scattered
+light comes from wide surroundings and is constant in a window.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .texture import DTYPE
+
+TERMS = 6  # terms of the background, a polynomial of degree 2
+PLANE_TERMS = 3  # those of degree 1
+MIN_DIRECT = 0.1  # least share of direct light in the light around a bead
+DARK = 1e-3  # grey value below which light cannot be distinguished from none
+LARGE = 0.1  # relative change of direct light that differs from that of its logarithm
+MAX_FACTOR = 20.0  # largest factor on the direct light in a step
+
+
+class Background:
+    """Light without beads in windows (n,) of pixels offset (m, 2), of radius window_px."""
+
+    def __init__(self, count: int, offset: NDArray[np.int64], window_px: float) -> None:
+        self.window_px = window_px
+        x, y = (offset.T / window_px).astype(DTYPE)
+        self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+        self.terms = np.zeros((count, TERMS))  # those of the logarithm of the direct light
+        #: (n,), light of the surroundings
+        self.around: NDArray[np.floating] = np.zeros(count)
+        self.plane_only = False  # whether the polynomial is of degree 1
+
+    def start(
+        self, light: NDArray[np.floating], around: NDArray[np.floating] | None, scatter: float
+    ) -> None:
+        """Set constant light (n,); around: that of the surroundings (n,), None if it is the same.
+
+        scatter: share of scattered light.
+        """
+        light = np.maximum(light, DARK)
+        self.around = light if around is None else np.maximum(around, DARK)
+        if scatter:
+            self.around = np.minimum(self.around, (1 - MIN_DIRECT) / scatter * light)
+        self.terms[:, 0] = np.log(light - scatter * self.around)
+
+    def direct(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the direct light (g, m) in windows."""
+        return np.asarray(np.exp(self.terms[rows].astype(DTYPE) @ self.basis.T))
+
+    def scattered(self, rows: NDArray[np.int64], scatter: float) -> NDArray[np.float32]:
+        """Return the scattered light (g, 1) in windows; scatter: its share."""
+        return DTYPE(scatter) * self.around[rows, None].astype(DTYPE)
+
+    def light(self, scatter: float) -> NDArray[np.float64]:
+        """Return the light (n,) in the middle of windows; scatter: share of scattered light."""
+        return np.asarray(np.exp(self.terms[:, 0]) + scatter * self.around)
+
+    def derivatives(
+        self, rows: NDArray[np.int64], passed: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """Return derivatives (g, m) of the light by the constant term; times basis by all terms.
+
+        passed: (g, m) direct light behind beads. The unit of a term is the direct light in the
+        middle of the window.
+        """
+        return np.asarray(passed * np.exp(-self.terms[rows, :1]).astype(DTYPE))
+
+    def changed(self, rows: NDArray[np.int64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return terms (g, TERMS) after a step of the direct light."""
+        change = step * np.exp(-self.terms[rows, :1])
+        large = np.flatnonzero(np.abs(change).max(axis=1, initial=0.0) > LARGE)
+        if len(large):
+            # A change of the light by a large factor is not the same change of its logarithm.
+            factor = np.maximum(1 + change[large].astype(DTYPE) @ self.basis.T, 1 / MAX_FACTOR)
+            terms = len(self._of_terms)
+            change[large, :terms] = np.log(np.minimum(factor, MAX_FACTOR)) @ self._of_terms.T
+        return self.terms[rows] + change
+
+    @cached_property
+    def _of_terms(self) -> NDArray[np.float32]:
+        """Matrix (t, m) that fits the terms that are estimated to the pixels of a window."""
+        return np.linalg.pinv(self.basis[:, :PLANE_TERMS] if self.plane_only else self.basis)
+
+    def steepest(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return directions (g,) in which the light of windows changes most [rad].
+
+        They are the principal axes of the gradient's second moments in a window (Foerstner and
+        Guelch, Intercommission Conference on Fast Processing of Photogrammetric Data, 1987).
+        """
+        _, by_x, by_y, by_xx, by_xy, by_yy = self.terms[rows].T
+        u = np.stack([by_x, by_xx, 0.5 * by_xy])
+        v = np.stack([by_y, 0.5 * by_xy, by_yy])
+        # The gradient is (u0 + 2 u1 x + 2 u2 y, ...); x^2 and y^2 have a mean of 1/4 in a circle.
+        return np.asarray(0.5 * np.arctan2(2 * (u * v).sum(axis=0), (u * u - v * v).sum(axis=0)))
+
+    def drawn(self, place: NDArray[np.float64], variance_px2: float) -> NDArray[np.float64]:
+        """Return how far (n, 2) a blur draws shadows towards less light [px], as a shift back.
+
+        place: (n, 2), centres relative to the middle of their windows [px]. If direct light is
+        proportional to exp(g x), a shadow that a Gaussian of variance s^2 blurs with it appears at
+        x - g s^2 (complete the square in the convolution).
+        """
+        x, y = place.T / self.window_px
+        _, by_x, by_y, by_xx, by_xy, by_yy = self.terms.T
+        gradient = by_x + 2 * by_xx * x + by_xy * y, by_y + by_xy * x + 2 * by_yy * y
+        return np.column_stack(gradient) * (variance_px2 / self.window_px)

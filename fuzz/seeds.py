@@ -145,9 +145,13 @@ def in_folder(write: Callable[[Path], object], name: str = '*') -> bytes:
         return next(out.glob(name)).read_bytes()
 
 
-@functools.cache
 def calibration(model: str = 'knn') -> FluoroscopeCalibration:
     """Return the calibration of a fluoroscope from a few exposures."""
+    return _calibration(model)  # f() and f('knn') differ for a cache
+
+
+@functools.cache
+def _calibration(model: str) -> FluoroscopeCalibration:
     exposures = simulate_exposures(rig(), 3, 1).frames
     request = CalibrationOptions(model=model, k=5 if model == 'knn' else None, max_iterations=2)
     result = calibrate({'a': exposures['a']}, rig().phantom, request)

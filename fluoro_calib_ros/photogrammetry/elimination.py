@@ -301,7 +301,12 @@ class EliminatePoints(Elimination):
         def points_between(p: NDArray[np.int64], q: NDArray[np.int64]) -> NDArray[np.float64]:
             is_same = (p == q)[:, None, None]
             fixed = np.where(is_same, covariance.conditional[p], 0.0)
-            return fixed - covariance.border[p] @ covariance.gain[q].transpose(0, 2, 1)
+            border, gain = covariance.border, covariance.gain
+            n, size, width = border.shape
+            if 2 * len(p) * width < size * n**2:  # too few pairs to multiply all points
+                return fixed - border[p] @ gain[q].transpose(0, 2, 1)
+            every = border.reshape(-1, width) @ gain.reshape(-1, width).T
+            return fixed - every.reshape(n, size, n, size)[p, :, q, :]
 
         return CovarianceBlocks(
             ee=ee,

@@ -6,6 +6,7 @@
 There are few examples per target, the same in every run. `make fuzz SECONDS=3600` runs longer.
 """
 
+import functools
 import re
 
 import pytest
@@ -71,6 +72,13 @@ def damaged(draw, seeds):
     return bytes(content)
 
 
+@functools.cache
+def target_and_seeds(name):
+    """Return a target and its seeds, some of which take long to make."""
+    target = load(name)
+    return target, list(target.seeds())
+
+
 def of_targets(names):
     """Return the parameters of a test; targets that need ROS get its marker."""
     return [pytest.param(n, marks=[pytest.mark.ros] if n in NEED_ROS else []) for n in names]
@@ -78,8 +86,7 @@ def of_targets(names):
 
 @pytest.mark.parametrize('name', of_targets(NAMES))
 def test_reader_gives_a_result_or_one_sentence(name, tmp_path):
-    target = load(name)
-    seeds = list(target.seeds())
+    target, seeds = target_and_seeds(name)
 
     @settings(
         max_examples=EXAMPLES.get(name, 40),
@@ -105,5 +112,5 @@ SEVERAL_KINDS = (
 @pytest.mark.parametrize('name', of_targets(n for n in NAMES if n not in SEVERAL_KINDS))
 def test_first_seed_is_accepted(name, tmp_path):
     """Otherwise the fuzzer would begin with an input that is refused at once."""
-    target = load(name)
-    assert check(target, target.seeds()[0], tmp_path)
+    target, seeds = target_and_seeds(name)
+    assert check(target, seeds[0], tmp_path)

@@ -25,7 +25,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.names import Names, number_names, safe_names
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.io.formats import registry
+from fluoro_calib_ros.io.formats import reader_process, registry
 from fluoro_calib_ros.io.formats.bodies import write_joint_motion
 from fluoro_calib_ros.io.formats.content import (
     Bodies,
@@ -38,6 +38,7 @@ from fluoro_calib_ros.io.formats.content import (
 )
 from fluoro_calib_ros.io.formats.tables import rate_of, table_of
 from fluoro_calib_ros.jobs.sources import read_source
+from fuzz.targets.c3d import run_forked
 
 SIZE = (1024, 768)
 SETTINGS = FileSettings(image_size=SIZE, units='mm')
@@ -83,6 +84,12 @@ def refused(path, settings=SETTINGS, kind=None):
         registry.read(path, settings, kind)
     assert '\n' not in str(caught.value)
     return str(caught.value)
+
+
+@pytest.fixture
+def forked(monkeypatch):
+    """Fork the process that reads a binary file; tests without this fixture start a program."""
+    monkeypatch.setattr(reader_process, 'run_module', run_forked)
 
 
 # ---- names
@@ -346,7 +353,7 @@ def test_no_code_of_a_file_of_deeplabcut_is_run(tmp_path):
         (lambda p: pandas_fixed(p, LABELLED, pandas_type='series'), 'it is a series of pandas'),
     ],
 )
-def test_hdf5_of_pandas_that_is_not_of_deeplabcut_is_refused(tmp_path, write, cause):
+def test_hdf5_of_pandas_that_is_not_of_deeplabcut_is_refused(tmp_path, write, cause, forked):
     with pytest.raises(DataError, match=cause) as error:
         registry.read(write(tmp_path / 'a.h5'), SETTINGS)
     assert '\n' not in str(error.value)
@@ -392,7 +399,7 @@ def sleap_file(path, order, named=True, **others):
         (('frame', 'track', 'node', 'xy'), True),
     ],
 )
-def test_points_of_sleap(tmp_path, order, named):
+def test_points_of_sleap(tmp_path, order, named, forked):
     path = sleap_file(tmp_path / 'labels.v001.000_camA.analysis.h5', order, named)
     content = registry.read(path, SETTINGS)
     ids = {'left hip': 1, 'left knee': 2, 'right hip': 3, 'right knee': 4}
@@ -426,13 +433,13 @@ def test_a_folder_of_sleap_returns(tmp_path):
         ({'point_scores': np.ones((2, 2, 5))}, 'tracks, point_scores and node_names are of'),
     ],
 )
-def test_hdf5_of_something_else_is_refused(tmp_path, others, cause):
+def test_hdf5_of_something_else_is_refused(tmp_path, others, cause, forked):
     path = sleap_file(tmp_path / 'a.h5', ('track', 'xy', 'node', 'frame'), **others)
     with pytest.raises(DataError, match=re.escape(cause)):
         registry.read(path, SETTINGS)
 
 
-def test_points_of_sleap_off_the_image_are_named(tmp_path):
+def test_points_of_sleap_off_the_image_are_named(tmp_path, forked):
     path = sleap_file(tmp_path / 'a.h5', ('track', 'xy', 'node', 'frame'))
     with pytest.raises(
         DataError, match=r'frame 2: the point .* is outside the image of 35 x 42 px'
@@ -663,7 +670,7 @@ def test_c3d_is_read_by_ezc3d(tmp_path):
     np.testing.assert_array_equal(residual < 0, ~seen[..., 0])
 
 
-def test_scale_and_residuals_of_c3d_are_where_the_user_guide_has_them(tmp_path):
+def test_scale_and_residuals_of_c3d_are_where_the_user_guide_has_them(tmp_path, forked):
     """As in py-c3d, the fourth word has the residual in its low byte, cameras in its high one."""
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
@@ -686,7 +693,7 @@ def dec(values):
 
 
 @pytest.mark.parametrize('kind', ['float', 'integer', 'DEC float'])
-def test_residuals_of_cameras_are_read_from_c3d(tmp_path, kind):
+def test_residuals_of_cameras_are_read_from_c3d(tmp_path, kind, forked):
     """Vicon and Qualisys write them with a mask of cameras in the high byte."""
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
@@ -903,7 +910,7 @@ def test_rotations_of_c3d_are_read_by_ezc3d(tmp_path):
         registry.write(path, 'c3d', Content(bodies=moving_bodies(None)), FileSettings())
 
 
-def test_rotation_of_c3d_that_is_none_is_refused(tmp_path):
+def test_rotation_of_c3d_that_is_none_is_refused(tmp_path, forked):
     bodies = moving_bodies()
     scaled = dataclasses.replace(bodies, rotation=2 * bodies.rotation)
     path = tmp_path / 'bodies.c3d'
@@ -1156,7 +1163,7 @@ def test_separator_of_a_table_is_that_of_its_first_row(text, separator, cells):
 @pytest.mark.parametrize(
     'kind', registry.kinds(lambda f: f.write and f.kind not in ('c3d', 'lut'))
 )
-def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
+def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind, forked):
     """They are truncated, or have missing, doubled or changed parts; only DataError is raised."""
     matrix = np.array([[4000.0, 0, 500], [0, 4000, 380], [0, 0, 1]])
     camera = Camera('cam1', matrix, SIZE, np.eye(3), np.zeros(3))
@@ -1176,7 +1183,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
     rng = np.random.default_rng(7)
     for path in map(pathlib.Path, written.paths):
         whole = path.read_bytes()
-        for _ in range(1 if kind == 'sleap' else 8):  # reading sleap starts a program
+        for _ in range(1 if kind == 'sleap' else 8):  # reading sleap starts a process
             for damaged in _damaged(whole, rng):
                 path.write_bytes(damaged)
                 for as_kind in (None, kind):

@@ -3,6 +3,7 @@
 
 """Angles in messages: the angle field of a calibration, earlier definitions, joint states."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +49,9 @@ def turning(plain):
     return rigs.turning(plain)
 
 
+@functools.cache
 def earlier_store(changes):
+    """Return message types with the definition after `changes` changes; do not modify them."""
     store = get_typestore(Stores.ROS2_JAZZY)
     text = earlier_text(FLUOROSCOPE_CALIBRATION, changes)
     store.register(get_types_from_msg(text, FLUOROSCOPE_CALIBRATION))

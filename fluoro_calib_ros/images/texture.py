@@ -302,7 +302,7 @@ class Texture:
                 own = order[across[textured] == one]
                 spectra.append(self._spectra(one, tuple(values[own] for values in part)))
             edges = Spectra.joined(spectra).strengths_at(excess, strengths.scale)
-            better = edges.evidence > strengths.evidence[textured]
+            better = _likely(edges.evidence - strengths.evidence[textured])
             strength[rows[textured[better]]] = edges.variance[better]
             direction[rows[textured[better]]] = across[textured[better]]
         return replace(self, strength=strength, across=direction)

@@ -284,7 +284,7 @@ class ShadowFit(ABC):
         for cosines, textured in self.texture.in_windows(rows):
             taken = cosines.eliminated(
                 self.texture.strength[rows[textured]],
-                relative=jacobian[textured, 0],
+                relative=self.background.passing(rows[textured], jacobian[textured, 0]),
                 jacobian=jacobian[textured],
                 weight=weight[textured],
                 residual=residual[textured],
@@ -309,7 +309,9 @@ class ShadowFit(ABC):
         self.correlation = self._correlation(residual[plain], valid[plain])
         rest = residual / np.maximum(root, DTYPE(1e-12))
         ends = np.cumsum([len(jacobian) for jacobian in jacobians])[:-1]
-        parts = list(zip(jacobians, np.split(root**2, ends), np.split(rest, ends)))
+        behind = np.concatenate([jacobian[:, 0] for jacobian in jacobians])
+        arrays = self.background.passing(rows, behind), root**2, rest
+        parts = list(zip(jacobians, *(np.split(array, ends) for array in arrays)))
         # The waves are longer than the correlation length of the noise.
         excess = float(self.correlation.sum())
         self.texture = self.texture.found(rows, parts, self.background.steepest(rows), excess)
@@ -415,7 +417,10 @@ class ShadowFit(ABC):
         touching = self.distance < 2 * self.profile.radius_px
         factor = np.where(touching, self.settings.crossed * factor, factor)
         sigma = np.sqrt(self.sigma**2 + by_correlation) * factor
-        drawn = self.background.drawn(self.uv - self.middle, self.profile.variance_px2)
+        # The noise of holes in a sheet does not increase with the inverted light: they are not
+        # shadows that attenuate it.
+        variance = self.profile.variance_px2 if self.noise.gain else 0.0
+        drawn = self.background.drawn(self.uv - self.middle, variance)
         return Beads(
             self.uv + DRAWN * drawn,
             np.hypot(sigma, DRAWN_SD * np.sqrt(0.5 * (drawn * drawn).sum(axis=1))),

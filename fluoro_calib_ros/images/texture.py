@@ -43,8 +43,11 @@ DIRECTIONS = 24
 NO_EDGE = -1
 
 
-# Derivatives (g, u, m) of the light in windows, its weights (g, m), and residuals (g, m).
-Part = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
+# Derivatives (g, u, m) of the light in windows; its share that passes the beads, its weights and
+# residuals (g, m).
+Part = tuple[
+    NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]
+]
 
 
 @lru_cache(maxsize=32)
@@ -315,19 +318,20 @@ class Texture:
             yield _cosines_in(self.squared_px, direction), textured[across == direction]
 
     def _spectra(self, across: int, part: Part) -> Spectra:
-        jacobian, weight, residual = part
+        jacobian, relative, weight, residual = part
         cosines = _cosines_in(self.squared_px, across)
-        return cosines.spectra(jacobian[:, 0], jacobian, weight=weight, residual=residual)
+        return cosines.spectra(relative, jacobian, weight=weight, residual=residual)
 
 
 def _chosen(parts: Sequence[Part], chosen: NDArray[np.bool_]) -> Part:
     """Return the chosen windows (n,) of all parts; derivatives by missing unknowns are zero."""
-    ends = np.cumsum([len(weight) for _, weight, _ in parts])[:-1]
+    ends = np.cumsum([len(part[0]) for part in parts])[:-1]
     some = np.split(chosen, ends)
-    jacobians, weights, residuals = zip(
+    jacobians, *others = zip(
         *(tuple(values[own] for values in part) for part, own in zip(parts, some))
     )
-    return _padded(jacobians), np.concatenate(weights), np.concatenate(residuals)
+    relative, weight, residual = (np.concatenate(arrays) for arrays in others)
+    return _padded(jacobians), relative, weight, residual
 
 
 def _padded(parts: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:

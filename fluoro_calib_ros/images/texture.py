@@ -30,7 +30,7 @@ EXPONENT = 3.0
 # Variance of the waves across a straight edge, relative to that of other waves of their length. In
 # eight renderings with plates, errors were the same to 2 % with 10 to 300; the larger, the smaller
 # were their standard deviations.
-EDGE = 30.0
+EDGE = 10.0
 # Ratios of the variance of the background to that of the noise that are compared. The likelihood
 # is wider than their steps: 20 cosines determine the strength to a factor of 1.4.
 STEP = 4.0
@@ -92,6 +92,10 @@ class Cosines:
                 if 0 < i * i + j * j <= HIGHEST**2
             ]
         )
+        if across is not None:
+            number = np.concatenate(
+                [number, [(i, 0) for i in range(HIGHEST + 1, 2 * HIGHEST + 1)]]
+            )
         self.waves = (
             np.cos(np.outer(number[:, 0], x)) * np.cos(np.outer(number[:, 1], y))
         ).astype(dtype)

@@ -244,7 +244,7 @@ class _MarkerFit(ShadowFit):
         if not len(rows):
             return
         self.crossing = np.zeros((len(self.uv), len(self.offset)))
-        grid = FineGrid(self.offset, self.profile.blur_px)
+        grid = FineGrid(self.offset, self.profile)
         axis = grid.axis
         for row in rows:
             neighbours = np.flatnonzero(self.close[row])[: self.settings.neighbours]

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from .background import PLANE_TERMS, TERMS
 from .detection import LARGER
 from .light import Light, Noise, less_common, vertex
-from .profile import HIGH, LOW, Absorbed, Profile, Shadows, fit_profile
+from .profile import LIMITS, MASKED, PLAIN, SHAPE, Absorbed, Profile, Shadows, fit_profile
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
@@ -56,6 +56,11 @@ MOST = 2.0  # largest factor between the radius of a bead and that of its detect
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
 START_SCATTER = 0.1
+START_SHARPENING = 1.0
+START_MASK_PX = 3.0
+# Share of the lack of fit in common from which an unsharp mask is looked for. It was .13 to .30 in
+# images with one of factor 1.5 and 3 px, and at most .06 in others, but .12 where light is clipped.
+COMMON = 0.1
 # Largest step of a coordinate of a bead that has converged: the next step is about ten times
 # shorter, and the centres of the sharpest beads are known to 0.01 px.
 SETTLED_PX = 0.003
@@ -82,46 +87,51 @@ def estimate_profile(
     shape: NDArray[np.float64],
     radius_px: float,
     size: NDArray[np.float64] | None = None,
-    known: Profile | None = None,
+    start: Profile | None = None,
+    estimated: Sequence[str] = PLAIN,
 ) -> Profile:
     """Estimate the shadow of a typical bead from isolated beads.
 
-    radius_px: initial value of its radius. known: profile whose share of scattered light is known;
-    it is replaced by a better fit with this share. The other arguments are those of
-    `measure_beads`.
+    radius_px: initial value of its radius. start: initial profile. estimated: parameters that are
+    estimated; if the scattered light is not, a start that fits better stays. The other arguments
+    are those of `measure_beads`.
     """
+    is_known = start is not None and 'scatter' not in estimated
     distance = cKDTree(uv).query(uv, k=[2])[0][:, 0] if len(uv) > 1 else np.full(1, np.inf)
     alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
     place = uv[alone]
     shapes = shape[alone], None if size is None else size[alone]
-    start = Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)
-    profiles = [known or start]
+    start = start or Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)
+    profiles = [start]
     lacks: list[float] = []
     while len(lacks) < PROFILE_ROUNDS and len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
         before = profiles[-1]
         fit = _profile_fit(light, place, shapes, before)
         place = fit.uv
         lacks.append(fit.typical())
-        profile = fit_profile(fit.absorbed(), before, is_scatter_known=known is not None)
+        profile = fit_profile(fit.absorbed(), before, estimated)
         if not radius_px / MOST < profile.radius_px < radius_px * MOST:
             break
         profiles.append(profile)
-        if _settled(profile, before):
-            if known is None:
+        if _settled(profile, before, estimated):
+            if not is_known:
                 return profile
             break
     reach_px = max(profile.reach_px for profile in profiles)
     # Skip the initial guess: it fits shadows as small as their blur about as well.
-    estimates = [known, profiles[-1]] if known else profiles[1:] or profiles
+    estimates = [start, profiles[-1]] if is_known else profiles[1:] or profiles
     fits = [_profile_fit(light, uv[alone], shapes, profile, reach_px) for profile in estimates]
     return min(fits, key=ShadowFit.typical).profile
 
 
-def _settled(profile: Profile, before: Profile) -> bool:
-    """Return whether radius and blur of a profile changed less than the tolerances."""
-    radius = abs(profile.radius_px / before.radius_px - 1)
-    blur = abs(profile.blur_px / before.blur_px - 1)
-    return radius < SETTLED and blur < RADIUS_SD
+def _settled(profile: Profile, before: Profile, estimated: Sequence[str]) -> bool:
+    """Return whether the estimated parameters of a profile changed less than the tolerances.
+
+    Attenuation and scattered light need not settle together: shadows hardly separate them.
+    """
+    names = SHAPE[:2] if 'scatter' in estimated else estimated
+    change = {name: abs(getattr(profile, name) / getattr(before, name) - 1) for name in names}
+    return change['radius_px'] < SETTLED and max(change.values()) < RADIUS_SD
 
 
 def _profile_fit(
@@ -288,7 +298,7 @@ class _BeadFit(ShadowFit):
         self, rows: NDArray[np.int64], members: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return differences (g, m) in windows of beads (g,) with members (g, k), -1 for none."""
-        grid = FineGrid(self.offset, self.profile.blur_px)
+        grid = FineGrid(self.offset, self.profile)
         axis = grid.axis
         raw = np.ones((len(rows), len(axis), len(axis)), dtype=np.float32)
         blurred = np.ones((len(rows), len(self.offset)))
@@ -405,10 +415,13 @@ class _BeadFit(ShadowFit):
         x, y = np.moveaxis(self.middle[:, None] + self.offset - self.uv[:, None], 2, 0)
         distance = np.sqrt(self._squared(every, x, y))
         known = self.valid & (self.grey > self.low) & (self.grey < self.high)
+        light = np.empty_like(self.grey)
+        for rows, near in self.groups:
+            light[rows] = self._model(rows, near)[0]
         good = (
             known & (self.measured & (self.misfit < UNDISTURBED * np.median(self.misfit)))[:, None]
         )
-        weight = plane / np.maximum(np.median(plane), 1e-9)
+        weight = plane**2 / np.maximum(light, 0.02 * plane) / np.maximum(np.median(plane), 1e-9)
         size = np.broadcast_to(rounded(self.size, 1 + RADIUS_SD)[:, None], good.shape)
         share = 1 - self.grey / plane
         around = self.background.around[:, None] / plane
@@ -418,25 +431,28 @@ class _BeadFit(ShadowFit):
         """Return the measured beads."""
         measured = self.measured & np.isfinite(self.uv).all(axis=1)
         typical = float(np.median(self.misfit[measured])) if measured.any() else 1.0
-        beads = self._beads(measured, typical, self._noise(measured))
+        beads = self._beads(measured, typical, self._noise())
         radius_sd = np.full(len(self.uv), RADIUS_SD)
         rows = np.flatnonzero(self.moved)
         radius_sd[rows[self._is_light_clipped(rows)]] = CLIPPED_RADIUS_SD
         return replace(beads, sigma=np.hypot(beads.sigma, radius_sd * self.moved))
 
-    def _noise(self, measured: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the lack of fit (n,) beyond the residuals that usual beads have in common.
+    def _noise(self) -> NDArray[np.float64]:
+        """Return the lack of fit (n,) beyond the residuals that usual beads have in common."""
+        share = np.where(self.texture.strength > 0, 0.0, self.common_share())
+        return (1 - share) * self.misfit
+
+    def common_share(self) -> NDArray[np.float64]:
+        """Return the share (n,) of the lack of fit that usual beads have in common.
 
         If shadows are not exactly those of spheres, residuals are alike in all windows. Such
         residuals are not noise and shift no centre relative to the others.
         """
-        usual = (
-            measured & (self.texture.strength == 0) & (self.misfit <= DISTURBED * self.typical())
-        )
+        usual = self.measured & (self.texture.strength == 0)
+        usual &= self.misfit <= DISTURBED * self.typical()
         rest = less_common(self.uv, self.radius, self.residual, self.counted, usual)
         whole = (self.residual**2 * self.counted).sum(axis=1)
-        share = np.minimum((rest**2).sum(axis=1) / np.maximum(whole, 1e-12), 1.0)
-        return np.where(self.texture.strength > 0, 1.0, share) * self.misfit
+        return np.maximum(1 - (rest**2).sum(axis=1) / np.maximum(whole, 1e-12), 0.0)
 
     def _is_light_clipped(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return (g,) whether nearly all pixels outside the shadows of windows are clipped."""
@@ -528,6 +544,7 @@ def first_imaging(
     imaging = Imaging(noise, profile, size)
     if not np.isfinite(size).all():
         imaging = _with_sizes(light, shadows, imaging)
+    imaging = _with_mask(light, shadows, imaging)
     return _with_scatter(light, shadows, imaging)
 
 
@@ -540,6 +557,39 @@ def _with_sizes(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     for _ in range(ROUNDS):
         sizes = sizes.with_sizes(alone, sizes.best(alone))
     return sizes.imaging
+
+
+def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
+    """Return a copy with the unsharp mask that the image has.
+
+    It gives shadows bright borders, so that shadows that are close move apart. It is only looked
+    for if some are close, and if the residuals of isolated shadows have a part in common.
+    """
+    size = imaging.size[shadows.row]
+    start = replace(
+        imaging.profile.with_scatter(START_SCATTER),
+        sharpening=START_SHARPENING,
+        mask_px=START_MASK_PX,
+    )
+    distance = _distance(shadows)
+    close = distance < 2 * imaging.profile.reach_px
+    alone = shadows.seen & np.isfinite(size) & (distance > 2 * start.reach_px)
+    rows = _sampled(np.flatnonzero(alone), SAMPLE)
+    if len(rows) < FEW or not close.any() or np.isfinite(light.high):
+        return imaging
+
+    sizes = _Sizes(light, shadows, imaging)
+    fit = sizes.fitted(rows, size[rows], STEPS - 1, (start.reach_px,) * 2)
+    if np.median(fit.common_share()[: len(rows)]) < COMMON:
+        return imaging
+    isolated = replace(shadows, alone=alone)
+    profile = _typical(light, isolated, imaging.size, start.radius_px, start, MASKED)
+    shapes = shadows.shape[rows], size[rows]
+    plain, masked = (
+        _profile_fit(light, shadows.uv[rows], shapes, one, profile.reach_px).typical()
+        for one in (imaging.profile, profile)
+    )
+    return replace(imaging, profile=profile) if masked < (1 - COMMON) * plain else imaging
 
 
 def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
@@ -568,10 +618,11 @@ def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         right, information = _scatter_equation(fit, len(overlapping))
         before = imaging.profile
         step = (right + weight * (first - before.scatter)) / (information + weight)
-        known = before.with_scatter(float(np.clip(before.scatter + step, LOW[3], HIGH[3])))
+        scatter = float(np.clip(before.scatter + step, *LIMITS['scatter']))
+        known = before.with_scatter(scatter)
         if abs(known.scatter - before.scatter) < SCATTER_STEP:
             break
-        profile = _typical(light, shadows, imaging.size, before.radius_px, known)
+        profile = _typical(light, shadows, imaging.size, before.radius_px, known, SHAPE)
         changed = replace(imaging, profile=profile)
         fit, changed_lack = fitted(changed)
         if np.mean(np.log(changed_lack / lack)) > 0:
@@ -643,6 +694,13 @@ def _overlapping(
     return known[distance[:, 1] < radius + radius[nearest]]
 
 
+def _distance(shadows: Expected) -> NDArray[np.float64]:
+    """Return distances (n,) of shadows from the nearest other one [px]."""
+    if len(shadows.uv) < 2:
+        return np.full(len(shadows.uv), np.inf)
+    return np.asarray(cKDTree(shadows.uv).query(shadows.uv, k=[2])[0][:, 0])
+
+
 def _sampled(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Return at most so many of some rows."""
     return rows[:: len(rows) // count + 1]
@@ -654,10 +712,11 @@ def _typical(
     size: NDArray[np.float64],
     radius_px: float,
     start: Profile | None = None,
+    estimated: Sequence[str] = PLAIN,
 ) -> Profile:
     """Estimate the profile of a bead of size 1 from isolated beads.
 
-    start: initial values, with the known share of scattered light.
+    start, estimated: those of `estimate_profile`.
     """
     seen = np.flatnonzero(shadows.seen & shadows.alone)
     if len(seen) < FEW:
@@ -669,7 +728,15 @@ def _typical(
     relative = relative[known] if known.any() else np.ones(len(seen))
     alike = rounded(relative, FINER_STEPS[1])
     shape = shadows.shape[seen] * (relative / alike)[:, None, None]
-    return estimate_profile(light, shadows.uv[seen], shape, radius_px, size=alike, known=start)
+    return estimate_profile(
+        light,
+        shadows.uv[seen],
+        shape,
+        radius_px,
+        size=alike,
+        start=start,
+        estimated=estimated,
+    )
 
 
 def rounded(size: NDArray[np.float64], step: float) -> NDArray[np.float64]:

@@ -5,7 +5,8 @@
 
 A ray at a distance d from the centre of a sphere of radius r is attenuated by exp(-2 m sqrt(r^2 -
 d^2)) (Beer and Lambert). Focal spot, detector and pixel blur it approximately as a Gaussian;
-scattered light adds a part that beads do not attenuate.
+scattered light adds a part that beads do not attenuate. An unsharp mask adds to the image a
+multiple of its difference from a wider blur, which gives shadows a bright border.
 """
 
 from __future__ import annotations
@@ -22,11 +23,22 @@ STEP = 0.2  # step of the grid on which a profile is computed [px]
 TABLE_STEP = 0.05  # step of the table of a profile [px]
 KERNEL_SIGMAS = 5.5  # half width of a Gaussian kernel, at which it is 3e-7
 REACH_SIGMAS = 3.2  # standard deviations of the blur beyond the radius at which a shadow ends
-# Bounds of radius [px], blur [px], attenuation along the radius, and scattered light.
-LOW = (0.5, 0.35, 0.05, 0.0)
-HIGH = (40.0, 6.0, 6.0, 0.6)
-MAX_ABSORBED = float(-np.expm1(-2 * HIGH[2]))  # share of the direct light
-CHANGE = 1.5  # largest factor on the first three in one fit
+MASK_SIGMAS = 2.2  # the same for the blur of an unsharp mask
+# Bounds of the parameters of a profile.
+LIMITS = {
+    'radius_px': (0.5, 40.0),
+    'blur_px': (0.35, 6.0),
+    'attenuation': (0.05, 6.0),
+    'scatter': (0.0, 0.6),
+    'sharpening': (0.0, 5.0),
+    'mask_px': (1.0, 8.0),
+}
+SHAPE = ('radius_px', 'blur_px', 'attenuation')  # parameters that are always estimated
+PLAIN = (*SHAPE, 'scatter')
+MASKED = (*SHAPE, 'sharpening', 'mask_px')
+MAX_ABSORBED = float(-np.expm1(-2 * LIMITS['attenuation'][1]))  # share of the direct light
+CHANGE = 1.5  # largest factor on parameters in one fit
+FREE = ('scatter', 'sharpening')  # parameters that any fit may change by any factor
 RING_PX = 0.25  # width of the rings to whose means a profile is fitted
 AROUND_STEP = 1.5  # ratio of shares of the surrounding light in rings that are kept apart
 AROUND_STEPS = 4  # largest number of such steps
@@ -40,16 +52,34 @@ class Profile:
     blur_px: float  #: standard deviation of the blur
     attenuation: float  #: attenuation coefficient times radius
     scatter: float = 0.0  #: share of the light that is not attenuated
+    sharpening: float = 0.0  #: factor of an unsharp mask
+    mask_px: float = 0.0  #: standard deviation of its blur
 
     @property
     def reach_px(self) -> float:
         """Distance from the centre at which the shadow ends [px]."""
-        return self.radius_px + REACH_SIGMAS * self.blur_px
+        reach = REACH_SIGMAS * self.blur_px
+        if self.sharpening:
+            reach = max(reach, MASK_SIGMAS * float(np.hypot(self.blur_px, self.mask_px)))
+        return self.radius_px + reach
+
+    @property
+    def blurs(self) -> tuple[tuple[float, float], ...]:
+        """Weights of Gaussians whose sum is the blur, and their standard deviations [px].
+
+        They include the blur of a square pixel, which has a variance of 1/12.
+        """
+        variance = self.blur_px**2 + 1 / 12
+        plain = float(np.sqrt(variance))
+        if not self.sharpening:
+            return ((1.0, plain),)
+        wider = float(np.sqrt(variance + self.mask_px**2))
+        return (1 + self.sharpening, plain), (-self.sharpening, wider)
 
     @property
     def variance_px2(self) -> float:
-        """Variance of the blur, including that of a square pixel, 1/12 [px^2]."""
-        return self.blur_px**2 + 1 / 12
+        """Variance of the blur [px^2]."""
+        return sum(weight * sigma**2 for weight, sigma in self.blurs)
 
     @cached_property
     def border_px(self) -> float:
@@ -64,7 +94,7 @@ class Profile:
     def sized(self, size: float) -> Profile:
         """Return the profile of a bead of another size, with attenuation in proportion."""
         attenuation = self.attenuation * size
-        return Profile(self.radius_px * size, self.blur_px, attenuation, self.scatter)
+        return replace(self, radius_px=self.radius_px * size, attenuation=attenuation)
 
     def with_scatter(self, scatter: float) -> Profile:
         """Return a profile with another share of scattered light and an equally dark middle."""
@@ -141,12 +171,12 @@ class Shadows:
 class _Blurred:
     """Shadow of a profile at multiples of TABLE_STEP from its centre."""
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: Profile, sigma: float) -> None:
         self._parts = max(1, int(min(STEP, profile.radius_px / 4) / TABLE_STEP))
         step = self._parts * TABLE_STEP
         # Only the row through the centre is needed: all columns are weighted to one row, which is
         # blurred along itself.
-        self.sigma = float(np.sqrt(profile.variance_px2))
+        self.sigma = sigma
         half = int(np.ceil(KERNEL_SIGMAS * self.sigma / step)) + 1
         count = max(int(np.ceil((profile.reach_px + 3) / step)) + 4, half + 1)
         self._axis = np.arange(count) * step
@@ -187,26 +217,40 @@ class _Blurred:
 
 def _tabulated(profile: Profile) -> NDArray[np.float64]:
     """Return absorbed shares and derivatives (2, n) at multiples of TABLE_STEP from the centre."""
-    blurred = _Blurred(profile)
-    row = blurred.row(profile.absorbed(blurred.squared))
-    return np.stack([blurred.table(row), blurred.table(row, 1)])
+    tables = []
+    for weight, sigma in profile.blurs:
+        blurred = _Blurred(profile, sigma)
+        row = blurred.row(profile.absorbed(blurred.squared))
+        tables.append(weight * np.stack([blurred.table(row), blurred.table(row, 1)]))
+    return np.asarray(sum(tables))
 
 
-def shadow_derivatives(profile: Profile, distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return derivatives (n, 3) of absorbed shares at distances (n,) [px].
+def shadow_derivatives(
+    profile: Profile, distance: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """Return derivatives (n,) of absorbed shares at distances (n,) [px] by all but the scatter.
 
-    They are with respect to radius [1/px], blur [1/px] and attenuation. A wider blur is a diffused
-    narrower blur, dS/dsigma = sigma (S_xx + S_yy), and a larger bead is a scaled bead.
+    A wider blur is a diffused narrower blur, dS/dsigma = sigma (S_xx + S_yy), and a larger bead is
+    a scaled bead.
     """
-    blurred = _Blurred(profile)
-    absorbed = profile.absorbed(blurred.squared)
-    row = blurred.row(absorbed)
-    laplacian = blurred.table(row, 2) + blurred.table(blurred.row(absorbed, 2))
-    scaled = blurred.distance * blurred.table(row, 1) + blurred.sigma**2 * laplacian
-    more = profile.chord(blurred.squared) * (1 - absorbed)
-    by_attenuation = blurred.table(blurred.row(more))
-    columns = -scaled / profile.radius_px, profile.blur_px * laplacian, by_attenuation
-    return np.column_stack([np.interp(distance, blurred.distance, one) for one in columns])
+    out = {name: np.zeros(len(distance)) for name in MASKED}
+    for number, (weight, sigma) in enumerate(profile.blurs):
+        blurred = _Blurred(profile, sigma)
+        absorbed = profile.absorbed(blurred.squared)
+        row = blurred.row(absorbed)
+        laplacian = blurred.table(row, 2) + blurred.table(blurred.row(absorbed, 2))
+        scaled = blurred.distance * blurred.table(row, 1) + sigma**2 * laplacian
+        more = profile.chord(blurred.squared) * (1 - absorbed)
+        tables = {
+            'radius_px': -weight * scaled / profile.radius_px,
+            'blur_px': weight * profile.blur_px * laplacian,
+            'attenuation': weight * blurred.table(blurred.row(more)),
+            'sharpening': (1.0, -1.0)[number] * blurred.table(row),
+            'mask_px': weight * number * profile.mask_px * laplacian,
+        }
+        for name, table in tables.items():
+            out[name] += np.interp(distance, blurred.distance, table)
+    return out
 
 
 @dataclass(frozen=True)
@@ -251,44 +295,46 @@ class _Binned:
     distance: NDArray[np.float64]
     around: NDArray[np.float64]  #: (n,), light of the surroundings over that without beads
 
-    def residual(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return weighted residuals (n,) for radius, blur, attenuation and scatter."""
-        value, _ = Profile(*unknowns[:3]).sized(self.size).shadow(self.distance)
-        return self.root * ((1 - unknowns[3] * self.around) * value - self.share)
+    def residual(self, profile: Profile) -> NDArray[np.float64]:
+        """Return weighted residuals (n,) for the profile of a bead of size 1."""
+        value, _ = profile.sized(self.size).shadow(self.distance)
+        return self.root * ((1 - profile.scatter * self.around) * value - self.share)
 
-    def slopes(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return derivatives (n, 4) of the residuals."""
-        profile = Profile(*unknowns[:3]).sized(self.size)
-        direct = 1 - unknowns[3] * self.around
-        by_shape = direct[:, None] * shadow_derivatives(profile, self.distance)
-        by_scatter = -self.around * profile.shadow(self.distance)[0]
-        columns = np.column_stack([by_shape * (self.size, 1.0, self.size), by_scatter])
-        return self.root[:, None] * columns
+    def slopes(self, profile: Profile, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return derivatives (n, k) of the residuals by parameters of the profile."""
+        sized = profile.sized(self.size)
+        direct = 1 - profile.scatter * self.around
+        by = {name: direct * one for name, one in shadow_derivatives(sized, self.distance).items()}
+        by['radius_px'] *= self.size
+        by['attenuation'] *= self.size
+        by['scatter'] = -self.around * sized.shadow(self.distance)[0]
+        return self.root[:, None] * np.column_stack([by[name] for name in names])
 
 
-def fit_profile(absorbed: Absorbed, start: Profile, is_scatter_known: bool = False) -> Profile:
+def fit_profile(absorbed: Absorbed, start: Profile, estimated: Sequence[str] = PLAIN) -> Profile:
     """Fit the profile of a bead of size 1 to the light absorbed by beads.
 
-    is_scatter_known: keep the share of scattered light of the start.
+    estimated: names of the parameters that are estimated; the others are those of the start.
     """
     parts = list(absorbed.binned(start))
-    known = [start.scatter] if is_scatter_known else []
-    count = 4 - len(known)
-    first = np.array([start.radius_px, start.blur_px, start.attenuation, start.scatter])
-    first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)[:count]
+    low, high = np.transpose([LIMITS[name] for name in estimated])
+    first = np.array([getattr(start, name) for name in estimated])
+    first = np.clip(first, low * 1.01 + 1e-3, high * 0.99)
     # The backgrounds were estimated with the previous profile.
-    change = np.append(np.full(3, CHANGE), np.inf)[:count]
-    bounds = (np.maximum(LOW[:count], first / change), np.minimum(HIGH[:count], first * change))
+    change = np.array([np.inf if name in FREE else CHANGE for name in estimated])
+    bounds = np.maximum(low, first / change), np.minimum(high, first * change)
+
+    def profile(values: NDArray[np.float64]) -> Profile:
+        return replace(start, **dict(zip(estimated, values.tolist())))
+
     # Few evaluations: `absorbed` is updated with each profile, and the radius and attenuation of a
     # small shadow are hardly separable.
     found = least_squares(
-        lambda x: np.concatenate([part.residual(np.append(x, known)) for part in parts]),
+        lambda x: np.concatenate([part.residual(profile(x)) for part in parts]),
         first,
-        jac=lambda x: np.concatenate([part.slopes(np.append(x, known)) for part in parts])[
-            :, :count
-        ],
+        jac=lambda x: np.concatenate([part.slopes(profile(x), estimated) for part in parts]),
         bounds=bounds,
         x_scale=first,
         max_nfev=5,
     )
-    return Profile(*map(float, found.x), *known)
+    return profile(found.x)

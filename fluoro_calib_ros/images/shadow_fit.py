@@ -105,16 +105,19 @@ class FineGrid:
     coordinates of the points, relative to the middle of a window [px].
     """
 
-    def __init__(self, offset: NDArray[np.int64], blur_px: float) -> None:
-        half = int(np.abs(offset).max()) + int(np.ceil(3 * blur_px))
+    def __init__(self, offset: NDArray[np.int64], profile: Profile) -> None:
+        self._blurs = profile.blurs
+        half = int(np.abs(offset).max()) + int(np.ceil(3 * self._blurs[-1][1]))
         self.axis = np.arange(-half * FINE, half * FINE + 1) / FINE
-        self._sigma = float(FINE * np.sqrt(blur_px**2 + 1 / 12))
         self._column, self._row = (offset.T + half) * FINE
 
     def blurred(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return blurred light (a, a) at the pixels (m,) of a window."""
-        smooth = cv2.GaussianBlur(light, (0, 0), self._sigma, borderType=cv2.BORDER_REPLICATE)
-        return smooth[self._row, self._column]
+        smooth = [
+            weight * cv2.GaussianBlur(light, (0, 0), FINE * sigma, borderType=cv2.BORDER_REPLICATE)
+            for weight, sigma in self._blurs
+        ]
+        return np.asarray(sum(smooth))[self._row, self._column]
 
 
 def _parts(rows: NDArray[np.int64], near: NDArray[np.int64], pixels: int) -> list[Group]:

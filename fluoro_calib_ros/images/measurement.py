@@ -58,8 +58,8 @@ START_ATTENUATION = 1.5
 START_SCATTER = 0.1
 START_SHARPENING = 1.0
 START_MASK_PX = 3.0
-# Share of the lack of fit in common from which an unsharp mask is looked for. It was .13 to .30 in
-# images with one of factor 1.5 and 3 px, and at most .06 in others, but .12 where light is clipped.
+# Common share of the lack of fit from which an unsharp mask is searched for. It was .13 to .30 in
+# images with a mask of factor 1.5 and 3 px, and at most .06 in others, but .12 in clipped light.
 COMMON = 0.1
 # Largest step of a coordinate of a bead that has converged: the next step is about ten times
 # shorter, and the centres of the sharpest beads are known to 0.01 px.

@@ -179,7 +179,7 @@ def test_beads_that_overlap_in_clipped_light_are_less_sure():
     clipped = overlapping_beads(12.12, most=500.0)
     assert list(clipped.overlapped) == [True, True, False]
     assert clipped.sigma[:2].min() > 4 * beads.sigma[:2].max()
-    assert clipped.sigma[2] < 3 * beads.sigma[2]
+    assert clipped.sigma[2] < 0.2 * clipped.sigma[:2].min()
 
 
 def test_two_overlapping_beads_have_honest_sigmas():
@@ -235,13 +235,35 @@ def test_shadow_whose_border_the_image_cuts_is_not_measured():
 def test_shadow_has_the_derivatives_of_its_differences(shape):
     """The differences are so wide that the grid of the shadow does not matter."""
     distance = np.arange(0, shape[0] + 3 * shape[1], 0.25)
-    derivatives = shadow_derivatives(Profile(*shape), distance)
-    for column, step in enumerate(np.diag([0.3, 0.02, 0.02])):
-        above, _ = Profile(*(shape + step)).shadow(distance)
-        below, _ = Profile(*(shape - step)).shadow(distance)
-        expected = (above - below) / (2 * step[column])
-        tolerance = 0.03 * np.abs(expected).max()
-        np.testing.assert_allclose(derivatives[:, column], expected, atol=tolerance)
+    for profile in (Profile(*shape), Profile(*shape, 0.0, sharpening=1.5, mask_px=2.5)):
+        derivatives = shadow_derivatives(profile, distance)
+        steps = {'radius_px': 0.3, **dict.fromkeys(derivatives, 0.02)} | {'radius_px': 0.3}
+        for name, step in steps.items():
+            if not profile.sharpening and name in ('sharpening', 'mask_px'):
+                continue
+            value = getattr(profile, name)
+            above, _ = replace(profile, **{name: value + step}).shadow(distance)
+            below, _ = replace(profile, **{name: value - step}).shadow(distance)
+            expected = (above - below) / (2 * step)
+            tolerance = 0.03 * np.abs(expected).max()
+            np.testing.assert_allclose(derivatives[name], expected, atol=tolerance)
+
+
+def test_an_unsharp_mask_adds_the_difference_from_a_wider_blur():
+    """The image is sharpened numerically; three reaches away, no shadow is left."""
+    profile = Profile(4.0, 1.0, 0.8, 0.1, sharpening=1.2, mask_px=3.0)
+    axis = np.arange(-200, 201) * 0.1
+    x, y = np.meshgrid(axis, axis)
+    raw = profile.absorbed(x * x + y * y)
+    plain = cv2.GaussianBlur(raw, (0, 0), 10 * np.sqrt(1 + 1 / 12))
+    masked = plain + 1.2 * (plain - cv2.GaussianBlur(plain, (0, 0), 30))
+    distance = np.arange(0, profile.reach_px, 0.5)
+    expected = np.interp(distance, axis[200:], masked[200, 200:])
+    np.testing.assert_allclose(profile.shadow(distance)[0], expected, atol=4e-3)
+    assert expected.min() < -0.05
+    assert profile.variance_px2 == pytest.approx(1 + 1 / 12 - 1.2 * 9)
+    sized = profile.sized(0.5)
+    assert (sized.sharpening, sized.mask_px, sized.radius_px) == (1.2, 3.0, 2.0)
 
 
 def test_profile_is_fitted_to_its_shadow():

@@ -105,8 +105,11 @@ def test_markers_that_touch_are_where_they_are_without_noise(apart, motion):
 
 @pytest.mark.parametrize('blur', [0.5, 2.0])
 def test_a_fine_grid_reaches_beyond_its_window_by_the_blur(blur):
-    grid = FineGrid(window_offsets(6.0), blur)
-    assert grid.axis[-1] == 6 + np.ceil(3 * blur) and grid.axis[0] == -grid.axis[-1]
+    grid = FineGrid(window_offsets(6.0), Profile(3.0, blur, 1.0))
+    assert (
+        grid.axis[-1] == 6 + np.ceil(3 * np.hypot(blur, 12**-0.5))
+        and grid.axis[0] == -grid.axis[-1]
+    )
     assert np.diff(grid.axis) == pytest.approx(1 / 3)
     plane = 100.0 + 3 * grid.axis[:, None] - 2 * grid.axis
     u, v = window_offsets(6.0).T

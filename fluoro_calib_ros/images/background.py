@@ -34,6 +34,7 @@ class Background:
         self.terms = np.zeros((count, TERMS))  # those of the logarithm of the direct light
         #: (n,), light of the surroundings
         self.around: NDArray[np.floating] = np.zeros(count)
+        self.scatter = 0.0  # share of scattered light, relative to that of the surroundings
         self.plane_only = False  # whether the polynomial is of degree 1
 
     def start(
@@ -43,6 +44,7 @@ class Background:
 
         scatter: share of scattered light.
         """
+        self.scatter = scatter
         light = np.maximum(light, DARK)
         self.around = light if around is None else np.maximum(around, DARK)
         if scatter:
@@ -53,13 +55,14 @@ class Background:
         """Return the direct light (g, m) in windows."""
         return np.asarray(np.exp(self.terms[rows].astype(DTYPE) @ self.basis.T))
 
-    def scattered(self, rows: NDArray[np.int64], scatter: float) -> NDArray[np.float32]:
-        """Return the scattered light (g, 1) in windows; scatter: its share."""
-        return DTYPE(scatter) * self.around[rows, None].astype(DTYPE)
+    def scattered(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the scattered light (g, 1) in windows."""
+        return DTYPE(self.scatter) * self.around[rows, None].astype(DTYPE)
 
-    def light(self, scatter: float) -> NDArray[np.float64]:
-        """Return the light (n,) in the middle of windows; scatter: share of scattered light."""
-        return np.asarray(np.exp(self.terms[:, 0]) + scatter * self.around)
+    @property
+    def light(self) -> NDArray[np.float64]:
+        """Light (n,) in the middle of windows."""
+        return np.asarray(np.exp(self.terms[:, 0]) + self.scatter * self.around)
 
     def derivatives(
         self, rows: NDArray[np.int64], passed: NDArray[np.floating]

@@ -19,8 +19,9 @@ from ..findings import Finding, Kind
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
 from .growth import Match, Seen, nearby_residuals, supported
+from .imaging import Expected, Imaging, first_imaging
 from .matching import PhantomModel, match
-from .measurement import FIRST_STEPS, STEPS, Expected, Imaging, first_imaging, measure_beads
+from .measurement import FIRST_STEPS, STEPS, measure_beads
 from .shadow_fit import MAX_SIGMA_PX, Beads
 from .view import Lens, View, fit_view
 

@@ -197,7 +197,7 @@ class _MarkerFit(ShadowFit):
             np.multiply(by_place, by_u[:, 0], out=jacobian[:, TERMS])
             np.multiply(by_place, by_v[:, 0], out=jacobian[:, TERMS + 1])
             np.multiply(-direct, shadow[:, 0], out=jacobian[:, TERMS + 2])
-            return self._scattered(rows) + behind, jacobian
+            return self.background.scattered(rows) + behind, jacobian
         exists = members >= 0
         depth = np.where(exists, self.depth[members], 0.0)[..., None]
         passed = np.maximum(1 - depth * shadow, MIN_PASSED)
@@ -209,7 +209,7 @@ class _MarkerFit(ShadowFit):
         jacobian[:, TERMS::3] = by_place * by_u
         jacobian[:, TERMS + 1 :: 3] = by_place * by_v
         jacobian[:, TERMS + 2 :: 3] = by_shadow * shadow * exists[..., None]
-        return self._scattered(rows) + behind, jacobian
+        return self.background.scattered(rows) + behind, jacobian
 
     def _disturbed(
         self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool

@@ -29,9 +29,10 @@ from .detection import (
     field_of_view,
     responses,
 )
+from .imaging import estimate_profile
 from .light import Light, Noise, estimate_noise, vertex
 from .marker_motion import GIVEN_GATE, GIVEN_SD_PX, MarkerStates, Motion, assign
-from .measurement import circles, estimate_profile
+from .measurement import circles
 from .profile import Profile
 
 MARKER_SCALES = SCALES[:5]  # markers are smaller than beads

@@ -221,10 +221,6 @@ class ShadowFit(ABC):
 
     # ---- parts of the model
 
-    def _scattered(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the scattered light (g, 1) in windows."""
-        return self.background.scattered(rows, self.profile.scatter)
-
     def _crossing_in(self, rows: NDArray[np.int64]) -> np.ndarray:
         """Return how shadows that touch differ, in windows, from the product of both shadows."""
         return DTYPE(0) if self.crossing is None else self.crossing[rows]
@@ -428,7 +424,7 @@ class ShadowFit(ABC):
             self.uv + DRAWN * drawn,
             np.hypot(sigma, DRAWN_SD * np.sqrt(0.5 * (drawn * drawn).sum(axis=1))),
             depth=self.depth.copy(),
-            light=self.background.light(self.profile.scatter),
+            light=self.background.light,
             misfit=self.misfit / max(typical, 1e-12),
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,

@@ -282,7 +282,7 @@ class Discs(ShadowFit):
         direct = self.background.direct(rows)
         jacobian = self._jacobian(rows, direct, 1 + k)
         jacobian[:, TERMS:] = rng.normal(size=jacobian[:, TERMS:].shape)
-        return self._scattered(rows) + direct, jacobian
+        return self.background.scattered(rows) + direct, jacobian
 
     def _disturbed(self, rows, near, final):
         return np.zeros(len(rows), dtype=bool)

@@ -10,19 +10,16 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.images.detection import field_of_view
-from fluoro_calib_ros.images.light import Light, Noise, estimate_noise
-from fluoro_calib_ros.images.measurement import (
+from fluoro_calib_ros.images.imaging import (
     Expected,
     Imaging,
-    _BeadFit,
-    _by_scatter,
     _Sizes,
     _typical,
-    circles,
     estimate_profile,
     first_imaging,
-    measure_beads,
 )
+from fluoro_calib_ros.images.light import Light, Noise, estimate_noise
+from fluoro_calib_ros.images.measurement import BeadFit, _by_scatter, circles, measure_beads
 from fluoro_calib_ros.images.profile import Profile
 
 FINE = 4  # grid points per pixel, along each axis
@@ -133,7 +130,7 @@ def test_windows_hold_the_largest_shadow_and_each_its_own():
     size = np.array([0.8, 1.0, 2.5])
     profile = Profile(8.0, 1.2, 0.1, 0.0)
     noise = estimate_noise(image, light.field)
-    fit = _BeadFit(light, uv, circles(np.ones(3)), profile=profile, noise=noise, size=size)
+    fit = BeadFit(light, uv, circles(np.ones(3)), profile=profile, noise=noise, size=size)
     reach = profile.reach_px * size
     length = np.linalg.norm(fit.offset, axis=1)
     assert length.max() >= reach.max()
@@ -276,7 +273,7 @@ def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
         def run(self, steps):
             pass
 
-    monkeypatch.setattr('fluoro_calib_ros.images.measurement._BeadFit', Fit)
+    monkeypatch.setattr('fluoro_calib_ros.images.imaging.BeadFit', Fit)
     reach = (1.6 + 2.0) * (5.0 + 3.2)  # of the largest compared and the known size
     others = np.array([[0.0, 0.99 * reach], [0.0, 1.01 * reach], [100.0, -0.99 * reach]])
     sizes = sizes_of(2, others)
@@ -312,7 +309,7 @@ def test_sizes_differ_where_the_common_one_fits_badly(monkeypatch, common, own, 
 
     monkeypatch.setattr(_Sizes, 'lacks', lacks)
     monkeypatch.setattr(
-        'fluoro_calib_ros.images.measurement._typical', lambda *_: sizes.imaging.profile
+        'fluoro_calib_ros.images.imaging._typical', lambda *_: sizes.imaging.profile
     )
     assert sizes.are_equal(rows) is is_equal
     assert sizes.are_equal(rows[:0])
@@ -330,7 +327,7 @@ def test_windows_at_the_edge_of_an_image_have_the_pixels_that_are_there():
     profile = Profile(4.0, 1.0, 1.0)
     u = np.array([40.0, 76, 74.9, 75, 4, 3.9, 40, 40, 40, 31, 60])
     uv = np.column_stack([u, [30, 30, 30, 30, 30, 30, 55, 56, 4, 30, 55.1]])
-    fit = _BeadFit(Light(grey, field), uv, circles(np.ones(11)), profile=profile, noise=NOISE)
+    fit = BeadFit(Light(grey, field), uv, circles(np.ones(11)), profile=profile, noise=NOISE)
     reach = profile.reach_px + 2
     for row, (u, v) in enumerate(np.rint(uv).astype(int)):
         for k, (du, dv) in enumerate(fit.offset):
@@ -347,7 +344,7 @@ def test_neighbours_are_those_within_reach_the_nearest_first():
     uv = np.array([[40.0, 30], [47, 30], [40, 42], [200, 30], [47, 30]])
     light = Light(np.full((90, 260), 100.0, np.float32), np.ones((90, 260), bool))
     profile = Profile(4.0, 1.0, 1.0)
-    fit = _BeadFit(light, uv, circles(np.ones(5)), profile=profile, noise=NOISE)
+    fit = BeadFit(light, uv, circles(np.ones(5)), profile=profile, noise=NOISE)
     together = 2 * profile.reach_px + 2
     away = np.linalg.norm(uv[:, None] - uv[None], axis=2)
     np.fill_diagonal(away, np.inf)
@@ -367,13 +364,13 @@ def test_windows_of_beads_that_look_larger_are_larger():
     light = Light(np.full((100, 400), 100.0, np.float32), np.ones((100, 400), bool))
     profile = Profile(5.0, 1.0, 1.0)
     stretch, size = np.array([0.5, 1.0, 1.6, 1.6]), np.array([1.0, 1.0, 1.0, 0.5])
-    fit = _BeadFit(light, uv, circles(stretch), profile=profile, noise=NOISE, size=size)
+    fit = BeadFit(light, uv, circles(stretch), profile=profile, noise=NOISE, size=size)
     reach = profile.reach_px * size * stretch + 2
     length = np.linalg.norm(fit.offset, axis=1)
     for valid, own in zip(fit.valid, reach):
         assert valid.tolist() == (length <= own).tolist()
     assert length.max() <= reach.max() and fit.radius.tolist() == (stretch * size).tolist()
-    wide = _BeadFit(light, uv, circles(stretch), profile, NOISE, size=size, reach_px=12.0)
+    wide = BeadFit(light, uv, circles(stretch), profile, NOISE, size=size, reach_px=12.0)
     length = np.linalg.norm(wide.offset, axis=1)
     for valid, own in zip(wide.valid, 12.0 * stretch + 2):
         assert valid.tolist() == (length <= own).tolist()
@@ -455,7 +452,7 @@ def test_light_behind_two_beads_changes_with_the_scattered_light():
     image, shadows = radiograph_of_pairs(0.2)
     light = Light(image, np.ones(image.shape, bool))
     profile = Profile(RADIUS, 1.2, ABSORBED * RADIUS, 0.2)
-    fit = _BeadFit(
+    fit = BeadFit(
         light, shadows.uv, shadows.shape, profile, Noise(0.0, 1.0, np.ones((1, 1))), np.ones(36)
     )
     fit.run(4)
@@ -467,6 +464,7 @@ def test_light_behind_two_beads_changes_with_the_scattered_light():
     slope = _by_scatter(fit, rows, near, before, jacobian)
     change = 1e-3
     fit.profile = replace(profile, scatter=0.2 + change)
+    fit.background.scatter = 0.2 + change
     # The light without beads stays the same.
     direct = np.exp(fit.background.terms[:, 0])
     fit.background.terms[:, 0] = np.log(direct - change * fit.background.around)

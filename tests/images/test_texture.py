@@ -119,7 +119,7 @@ def test_a_large_step_is_one_of_the_light():
     """The logarithm of a line is no line; its polynomial is the best one of degree 2."""
     background = Background(2, OFFSET, 8.0)
     background.start(np.array([100.0, 200.0]), np.array([50.0, 100.0]), 0.2)
-    assert background.light(0.2) == pytest.approx([100, 200])
+    assert background.light == pytest.approx([100, 200])
     assert np.allclose(background.direct(np.arange(2)).T, [90, 180], rtol=1e-5)
     step = np.zeros((2, 6))
     step[0, 1] = 63.0  # the light at the border changes by 70 %
@@ -137,7 +137,7 @@ def test_direct_light_is_at_least_a_tenth_in_the_dark():
     background = Background(1, OFFSET, 8.0)
     background.start(np.array([10.0]), np.array([500.0]), 0.1)
     assert np.exp(background.terms[0, 0]) == pytest.approx(1.0)
-    assert background.light(0.1) == pytest.approx([10.0])
+    assert background.light == pytest.approx([10.0])
 
 
 def test_blur_draws_a_shadow_towards_less_light():

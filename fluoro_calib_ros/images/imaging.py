@@ -37,7 +37,7 @@ START_SCATTER = 0.1
 START_SHARPENING = 1.0
 START_MASK_PX = 3.0
 # Common share of the lack of fit from which an unsharp mask is searched for. It was .21 to .43 in
-# twelve images with a mask of factor 1.5 and 3 px, and at most .15 in 40 images without one but in
+# four images with a mask of factor 1.5 and 3 px, and at most .15 in 41 images without one but in
 # one, whose profile was not the best.
 COMMON = 0.15
 MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image

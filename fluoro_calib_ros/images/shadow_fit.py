@@ -313,7 +313,7 @@ class ShadowFit(ABC):
         parts = list(zip(jacobians, *(np.split(array, ends) for array in arrays)))
         # The waves are longer than the correlation length of the noise.
         excess = float(self.correlation.sum())
-        self.texture = self.texture.found(rows, parts, self.background.steepest(rows), excess)
+        self.texture = self.texture.estimated(rows, parts, self.background.steepest(rows), excess)
 
     def _standardised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Return standardised residuals of all windows.

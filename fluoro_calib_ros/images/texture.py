@@ -270,7 +270,7 @@ class Texture:
     """Backgrounds of windows (n,) beyond a polynomial."""
 
     strength: NDArray[np.float64]  #: (n,), variances, 0 for windows without such a background
-    #: (n,), directions across a straight edge in steps of half a turn, NO_EDGE for none
+    #: (n,), numbers of the directions across a straight edge, NO_EDGE for none
     across: NDArray[np.int64]
     squared_px: int  #: square of the radius of the windows
 
@@ -280,7 +280,7 @@ class Texture:
         squared_px = int((offset**2).sum(axis=1).max(initial=0))
         return cls(np.zeros(count), np.full(count, NO_EDGE), squared_px)
 
-    def found(
+    def estimated(
         self,
         rows: NDArray[np.int64],
         parts: Sequence[Part],

@@ -74,12 +74,11 @@ class Background:
         """
         return np.asarray(passed * np.exp(-self.terms[rows, :1]).astype(DTYPE))
 
-    def passing(
-        self, rows: NDArray[np.int64], derivative: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return the share (g, m) of direct light behind beads, given the derivatives (g, m)."""
-        middle = np.exp(self.terms[rows, :1]).astype(DTYPE)
-        return derivative * middle / np.maximum(self.direct(rows), DTYPE(1e-30))
+    def relative(
+        self, rows: NDArray[np.int64], light: NDArray[np.floating]
+    ) -> NDArray[np.floating]:
+        """Return light (g, m) as a fraction of that without beads."""
+        return light / (self.direct(rows) + self.scattered(rows))
 
     def changed(self, rows: NDArray[np.int64], step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return terms (g, TERMS) after a step of the direct light."""

@@ -283,7 +283,7 @@ class ShadowFit(ABC):
         for cosines, textured in self.texture.in_windows(rows):
             taken = cosines.eliminated(
                 self.texture.strength[rows[textured]],
-                relative=self.background.passing(rows[textured], jacobian[textured, 0]),
+                relative=self.background.relative(rows[textured], light[textured]),
                 jacobian=jacobian[textured],
                 weight=weight[textured],
                 residual=residual[textured],
@@ -299,7 +299,7 @@ class ShadowFit(ABC):
 
     def _add_texture(self) -> None:
         """Add a background beyond the polynomial to beads whose pixels show one."""
-        rows, residual, root, jacobians = self._standardised()
+        rows, relative, residual, root, jacobians = self._standardised()
         plain = np.flatnonzero(self.misfit[rows] <= self.typical())
         plain = plain[:: len(plain) // CORRELATED + 1]
         valid = root > 0
@@ -308,18 +308,19 @@ class ShadowFit(ABC):
         self.correlation = self._correlation(residual[plain], valid[plain])
         rest = residual / np.maximum(root, DTYPE(1e-12))
         ends = np.cumsum([len(jacobian) for jacobian in jacobians])[:-1]
-        behind = np.concatenate([jacobian[:, 0] for jacobian in jacobians])
-        arrays = self.background.passing(rows, behind), root**2, rest
+        arrays = relative, root**2, rest
         parts = list(zip(jacobians, *(np.split(array, ends) for array in arrays)))
         # The waves are longer than the correlation length of the noise.
         excess = float(self.correlation.sum())
         self.texture = self.texture.estimated(rows, parts, self.background.steepest(rows), excess)
 
-    def _standardised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
+    def _standardised(
+        self,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Return standardised residuals of all windows.
 
-        Return the beads (n,), residuals (n, m), roots (n, m) of weights, 0 for invalid pixels, and
-        the derivatives for each part of the windows in order.
+        Return the beads (n,), light as a fraction of that without beads, residuals and roots of
+        weights (n, m), 0 for invalid pixels, and the derivatives for each part of the windows.
         """
         groups = [part for group in self.groups for part in _parts(*group, len(self.offset))]
         lights, jacobians = zip(*(self._model(*part) for part in groups))
@@ -327,7 +328,8 @@ class ShadowFit(ABC):
         rows = np.concatenate([rows for rows, _ in groups])
         grey = self.grey[rows]
         root = self._valid(rows, grey, light) / np.sqrt(self.noise.variance(light), dtype=DTYPE)
-        return rows, (grey - light) * root, root, list(jacobians)
+        relative = self.background.relative(rows, light)
+        return rows, relative, (grey - light) * root, root, list(jacobians)
 
     def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
         """Return the correlation of the noise from standardised residuals (g, m) of windows.

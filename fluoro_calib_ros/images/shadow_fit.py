@@ -299,7 +299,7 @@ class ShadowFit(ABC):
 
     def _add_texture(self) -> None:
         """Add a background beyond the polynomial to beads whose pixels show one."""
-        rows, relative, residual, root, jacobians = self._standardised()
+        (rows, relative, residual, root), jacobians = self._standardised()
         plain = np.flatnonzero(self.misfit[rows] <= self.typical())
         plain = plain[:: len(plain) // CORRELATED + 1]
         valid = root > 0
@@ -314,13 +314,11 @@ class ShadowFit(ABC):
         excess = float(self.correlation.sum())
         self.texture = self.texture.estimated(rows, parts, self.background.steepest(rows), excess)
 
-    def _standardised(
-        self,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Return standardised residuals of all windows.
+    def _standardised(self) -> tuple[tuple[np.ndarray, ...], list[np.ndarray]]:
+        """Return standardised residuals of all windows, and the derivatives of each part of them.
 
-        Return the beads (n,), light as a fraction of that without beads, residuals and roots of
-        weights (n, m), 0 for invalid pixels, and the derivatives for each part of the windows.
+        The first are the beads (n,), light as a fraction of that without beads (n, m), residuals
+        (n, m), and roots of weights (n, m), 0 for invalid pixels.
         """
         groups = [part for group in self.groups for part in _parts(*group, len(self.offset))]
         lights, jacobians = zip(*(self._model(*part) for part in groups))
@@ -329,7 +327,7 @@ class ShadowFit(ABC):
         grey = self.grey[rows]
         root = self._valid(rows, grey, light) / np.sqrt(self.noise.variance(light), dtype=DTYPE)
         relative = self.background.relative(rows, light)
-        return rows, relative, (grey - light) * root, root, list(jacobians)
+        return (rows, relative, (grey - light) * root, root), list(jacobians)
 
     def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
         """Return the correlation of the noise from standardised residuals (g, m) of windows.

@@ -95,7 +95,7 @@ def test_bumped_rig_is_healed_and_its_points_are_right_again(rig, tmp_path, caps
     assert learned.orientation_ids == (before.orientation_id, after.orientation_id)
     again = ('heal', rig / 'bumped', '--calibration', healed, '--out', tmp_path / 'again')
     assert run(*again) == 0
-    assert 'as it was calibrated' in capsys.readouterr().out
+    assert 'the calibration stays as it was' in capsys.readouterr().out
     change = document['changes']['b']
     np.testing.assert_array_less(
         np.abs(np.radians(change['rotation_deg']) - TURNED_RAD),
@@ -140,7 +140,7 @@ def test_what_cannot_be_healed_is_refused(rig, tmp_path, capsys):
     )
     base = ('heal', rig / 'bumped', '--calibration', rig / 'result', '--out', tmp_path / 'out')
     assert run(*base, '--bodies', unknown) == 1
-    assert 'body femur: the places of 0 of its 4 markers are known' in capsys.readouterr().err
+    assert 'body femur: the coordinates of only 0 of its 4 markers are known' in capsys.readouterr().err
     assert run(*base, '--bodies', shapes, '--orientation', tmp_path / 'none.npz') == 1
     plain = shutil.copytree(rig / 'result', tmp_path / 'plain')
     (plain / LEARNED_SHAPES).unlink()

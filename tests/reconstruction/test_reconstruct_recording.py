@@ -250,7 +250,7 @@ def test_a_drift_that_ended_before_the_recording_is_reported():
     found = watched(frames, 'ab').verdict()
     assert (found.level, found.level_at_end) == ('error', 'ok') and found.state.fluoroscope == 'b'
     assert (
-        'after the beginning; no longer detected at the end: the calibration no longer holds'
+        'after the start; no longer detected at the end: the calibration no longer holds'
         in found.message
     )
 

@@ -300,5 +300,5 @@ def test_damaged_file_of_bodies_ends_the_node_in_a_sentence(graph, by_command, t
     parameters = {'calibration_directory': by_command, 'bodies': file}
     node = graph.start('reconstruction_node', parameters, wait=False)
     assert node.wait() == 1
-    assert f'{file}: body femur: the places of 2 of its 2 markers are known' in node.log
+    assert f'{file}: body femur: the coordinates of only 2 of its 2 markers are known' in node.log
     assert 'Traceback' not in node.log

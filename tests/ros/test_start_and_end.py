@@ -163,7 +163,7 @@ PHANTOM = {'phantom': BAGS / 'phantom.csv'}
             },
             'Unexpected QoS override',
         ),
-        ('simulator_node', {'scene': 'cat'}, 'parameter scene is'),
+        ('simulator_node', {'scene': 'cat'}, 'parameter scene must be one of'),
         ('player_node', {}, 'parameter bag is not set'),
         ('player_node', {'bag': '/nowhere/bag'}, '/nowhere/bag: there is no such bag'),
         (

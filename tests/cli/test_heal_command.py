@@ -140,7 +140,10 @@ def test_what_cannot_be_healed_is_refused(rig, tmp_path, capsys):
     )
     base = ('heal', rig / 'bumped', '--calibration', rig / 'result', '--out', tmp_path / 'out')
     assert run(*base, '--bodies', unknown) == 1
-    assert 'body femur: the coordinates of only 0 of its 4 markers are known' in capsys.readouterr().err
+    assert (
+        'body femur: the coordinates of only 0 of its 4 markers are known'
+        in capsys.readouterr().err
+    )
     assert run(*base, '--bodies', shapes, '--orientation', tmp_path / 'none.npz') == 1
     plain = shutil.copytree(rig / 'result', tmp_path / 'plain')
     (plain / LEARNED_SHAPES).unlink()

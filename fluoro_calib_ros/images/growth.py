@@ -381,5 +381,6 @@ class _Kriging:
 
 def _matern(shift: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return Matern's covariance of order 3/2 at shifts (..., 2) in units of its length."""
-    distance = np.sqrt(3) * np.hypot(shift[..., 0], shift[..., 1])
-    return (1 + distance) * np.exp(-distance)
+    x, y = shift[..., 0], shift[..., 1]
+    distance = np.sqrt(3 * (x * x + y * y))
+    return np.asarray((1 + distance) * np.exp(-distance))

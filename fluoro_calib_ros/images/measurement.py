@@ -140,13 +140,12 @@ class BeadFit(ShadowFit):
     def _read(self, light: Light, window_px: NDArray[np.float64]) -> None:
         """Read the windows (n, m) around the beads, each with its own radius (n,)."""
         height, width = light.grey.shape
-        places = self.middle[:, None] + self.offset
-        inside = ((places >= 0) & (places < (width, height))).all(axis=2)
+        column, row = self.middle.T[..., None] + self.offset.T[:, None]
         own = (self.offset * self.offset).sum(axis=1) <= window_px[:, None] ** 2
-        column = np.clip(places[..., 0], 0, width - 1)
-        row = np.clip(places[..., 1], 0, height - 1)
-        valid = inside & light.field[row, column]
-        grey = light.grey[row, column].astype(np.float32)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = np.where(inside, row * width + column, 0)
+        valid = inside & light.field.take(pixel)
+        grey = light.grey.take(pixel)
         self.low = light.low
         self.high = light.high
         bright = np.where(valid, grey, 0.0)

@@ -85,6 +85,7 @@ class Cosines:
         angle = across or 0.0
         turned = offset @ [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
         x, y = (turned.T + half) * (np.pi / (2 * half))
+        along_x, along_y = (np.cos(np.outer(np.arange(2 * HIGHEST + 1), one)) for one in (x, y))
         number = np.array(
             [
                 (i, j)
@@ -96,9 +97,7 @@ class Cosines:
             number = np.concatenate(
                 [number, [(i, 0) for i in range(HIGHEST + 1, 2 * HIGHEST + 1)]]
             )
-        self.waves = (
-            np.cos(np.outer(number[:, 0], x)) * np.cos(np.outer(number[:, 1], y))
-        ).astype(dtype)
+        self.waves = (along_x[number[:, 0]] * along_y[number[:, 1]]).astype(dtype)
         power = np.sum(number**2, axis=1) ** (-EXPONENT / 2)
         if across is not None:
             power[number[:, 1] == 0] *= EDGE
@@ -136,9 +135,8 @@ class Cosines:
         normal[:, diagonal, diagonal] *= 1 + 1e-9
         normal[:, diagonal, diagonal] += 1e-12
         cross = products[:, :unknowns, unknowns:]
-        reduced = products[:, unknowns:, unknowns:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(
-            normal, cross
-        )
+        explained = np.swapaxes(cross, 1, 2) @ (np.linalg.inv(normal) @ cross)
+        reduced = products[:, unknowns:, unknowns:] - explained
         noise = 1 / np.maximum(np.mean(weight, axis=1), 1e-12)
         reduced[:, :-1] *= np.sqrt(noise)[:, None, None]
         reduced[:, :, :-1] *= np.sqrt(noise)[:, None, None]

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,9 +154,12 @@ class View:
         return basis @ self.coefficients.T, slope / self.lens.half_px, basis
 
 
+@cache
 def exponents(degree: int) -> NDArray[np.int64]:
     """Return exponents (k, 2) of the monomials of degree 1 to `degree`, in order of degree."""
-    return np.array([(n - j, j) for n in range(1, degree + 1) for j in range(n + 1)])
+    out = np.array([(n - j, j) for n in range(1, degree + 1) for j in range(n + 1)])
+    out.flags.writeable = False
+    return out
 
 
 def _monomials(

@@ -76,9 +76,10 @@ def fit_markers(
     pixels = len(fit.offset)
     fit.inflation = inflation.get(pixels)
     fit.run()
+    beads = fit.result()
     if fit.inflation is not None:
         inflation[pixels] = fit.inflation
-    return fit.result()
+    return beads
 
 
 @lru_cache(maxsize=8)
@@ -233,7 +234,7 @@ class _MarkerFit(ShadowFit):
     ) -> np.ndarray:
         if not final:
             return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
-        inverse = self._note_precision(rows, equations)
+        inverse = self._note_precision(rows, equations, np.arange(len(rows)))
         return (inverse @ equations.right[..., None])[..., 0]
 
     def _cross(self) -> None:

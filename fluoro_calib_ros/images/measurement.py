@@ -21,6 +21,7 @@ from .profile import Absorbed, Profile, Shadows
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
+    FINE,
     MARGIN_PX,
     MIN_INSIDE,
     MIN_PASSED,
@@ -115,7 +116,6 @@ class BeadFit(ShadowFit):
             SETTINGS, profile, noise=noise, uv=uv, depth=np.ones(len(uv)), window_px=window
         )
         self.radius = self.stretch * self.size
-        self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
         self.moved = np.zeros(len(uv))  # RMS shift of u and v by relative errors 1 of radii [px]
         self.residual = np.zeros((len(uv), len(self.offset)), dtype=np.float32)  # at the last step
@@ -156,18 +156,22 @@ class BeadFit(ShadowFit):
         self.usable &= from_edge >= self.profile.radius_px * self.radius
 
     def run(self, steps: int) -> None:
-        """Take Gauss-Newton steps; the last step also yields standard deviations.
+        """Take Gauss-Newton steps.
 
-        Converged beads only take part in the last step and after changes to the model of their
-        window.
+        Converged beads only take part after changes to the model of their window, and those with
+        neighbours in the last step.
         """
         active = np.ones(len(self.uv), dtype=bool)
         for step in range(steps):
             final = step == steps - 1
-            active |= final
             if step in self.settings.crossing_steps:
                 active |= self._cross()
-            groups = [(rows[active[rows]], near[active[rows]]) for rows, near in self.groups]
+            taking_part = [
+                active[rows] | (final and near.shape[1] > 0) for rows, near in self.groups
+            ]
+            groups = [
+                (rows[taken], near[taken]) for (rows, near), taken in zip(self.groups, taking_part)
+            ]
             moved = [self._step(rows, near, final) for rows, near in groups]
             for (rows, _), (uv, depth, background) in zip(groups, moved):
                 lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
@@ -213,19 +217,24 @@ class BeadFit(ShadowFit):
         """Return differences (g, m) in windows of beads (g,) with members (g, k), -1 for none."""
         grid = FineGrid(self.offset, self.profile)
         axis = grid.axis
-        raw = np.ones((len(rows), len(axis), len(axis)), dtype=np.float32)
+        raw = np.ones((len(rows), len(axis), len(axis)), dtype=DTYPE)
         blurred = np.ones((len(rows), len(self.offset)))
+        window = np.arange(len(rows))[:, None, None]
         for column in members.T:
             there = column >= 0
             bead = np.where(there, column, 0)
             centre = self.uv[bead] - self.middle[rows]
             depth = self.depth[bead] * there
-            x = axis[None, None, :] - centre[:, 0, None, None]
-            y = axis[None, :, None] - centre[:, 1, None, None]
+            # The points of a square that contains the bead.
+            count = min(int(2 * FINE * self._extent_px(bead).max()) + 3, len(axis))
+            first = np.rint((centre - axis[0]) * FINE).astype(int) - count // 2
+            place = np.clip(first, 0, len(axis) - count)[..., None] + np.arange(count)
+            x, y = np.moveaxis(axis[place] - centre[..., None], 1, 0).astype(DTYPE)
             size = self.size[bead, None, None]
-            squared = self._squared(bead, x, y) / size**2
-            absorbed = self.profile.absorbed(squared, size)
-            raw *= (1 - depth[:, None, None] * absorbed).astype(np.float32)
+            squared = self._squared(bead, x[:, None], y[:, :, None]) / size**2
+            absorbed = self.profile.absorbed(squared.astype(DTYPE), size.astype(DTYPE))
+            points = window, place[:, 1, :, None], place[:, 0, None]
+            raw[points] *= 1 - depth[:, None, None] * absorbed
             x, y = np.moveaxis(self.offset - centre[:, None], 2, 0)
             away = np.sqrt(self._squared(bead, x, y))
             blurred *= 1 - depth[:, None] * self.shadows.shadow(away, self.kind[bead])[0]
@@ -233,6 +242,11 @@ class BeadFit(ShadowFit):
         for number, image in enumerate(raw):
             out[number] = grid.blurred(image)
         return out - blurred
+
+    def _extent_px(self, beads: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return distances (g,) from the centres beyond which beads absorb no light [px]."""
+        widest = np.linalg.inv(self.metric[beads])[:, [0, 1], [0, 1]].max(axis=1)
+        return np.asarray(self.profile.radius_px * self.size[beads] * np.sqrt(widest))
 
     def _squared(
         self, beads: NDArray[np.int64], x: NDArray[np.float64], y: NDArray[np.float64]
@@ -291,15 +305,24 @@ class BeadFit(ShadowFit):
         equations: NormalEquations,
         final: bool,
     ) -> np.ndarray:
+        step = np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
+        noted = np.full(len(rows), final)
+        if not near.shape[1]:
+            noted |= (np.abs(step[:, TERMS : TERMS + 2]) <= SETTLED_PX).all(axis=1)
+        part = np.flatnonzero(noted)
+        self._note_precision(rows, equations, part)
+        self.residual[rows[part]] = equations.residual[part]
+        self.counted[rows[part]] = equations.valid[part]
         if final:
-            self._note_precision(rows, equations)
             touching = np.flatnonzero(self._touching(rows, near))
             if len(touching):
                 self._note_shifts(rows[touching], near[touching], equations, touching)
-            self.measured[rows] = self.usable[rows] & np.isfinite(self.sigma[rows])
-            self.residual[rows] = equations.residual
-            self.counted[rows] = equations.valid
-        return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
+        return step
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Whether beads (n,) have converged with a standard deviation."""
+        return self.usable & np.isfinite(self.sigma)
 
     def _note_shifts(
         self,

@@ -158,9 +158,10 @@ class ShadowFit(ABC):
         n = len(self.uv)
         self.background = Background(n, self.offset, window_px)
         self.sigma = np.full(n, np.inf)  # of centres, for independent noise of the pixels [px]
-        self.noise_sigma = np.full(n, np.inf)  # the part of it due to the noise
+        self.noise_sigma = np.zeros(n)  # the part of it due to the noise
         self.correlation = noise.correlation
         self.inflation: float | None = None  # correlation: factor on the variances of that part
+        self.influence: np.ndarray | None = None  # of the pixels (k, m) of some windows on centres
         self.misfit = np.full(n, np.inf)
         self.distance = np.full(n, np.inf)  # distance of the nearest bead
         self.low = -np.inf  # grey values at which the image is clipped
@@ -370,21 +371,24 @@ class ShadowFit(ABC):
         half = len(values) // 2
         return float(values[half] if len(values) % 2 else values[half - 1 : half + 1].mean())
 
-    def _note_precision(self, rows: NDArray[np.int64], equations: NormalEquations) -> np.ndarray:
-        """Note standard deviations of centres; return the covariances (g, u, u)."""
-        inverse = np.linalg.inv(equations.matrix)
-        self.sigma[rows] = self.noise_sigma[rows] = _sd_of_centre(inverse)
-        textured = np.flatnonzero(self.texture.strength[rows])
+    def _note_precision(
+        self, rows: NDArray[np.int64], equations: NormalEquations, part: NDArray[np.int64]
+    ) -> np.ndarray:
+        """Note standard deviations of some centres; return their covariances (p, u, u).
+
+        part: (p,) which of the beads in rows (g,) they are.
+        """
+        inverse = np.linalg.inv(equations.matrix[part])
+        self.sigma[rows[part]] = self.noise_sigma[rows[part]] = _sd_of_centre(inverse)
+        textured = part[self.texture.strength[rows[part]] > 0]
         if len(textured):
             self.noise_sigma[rows[textured]] = _sd_of_centre(
                 np.linalg.inv(equations.plain[textured])
             )
-        if self.inflation is None:
-            # Influence of pixels on a centre: correlated noise of neighbouring pixels adds up.
-            plain = equations.plain[:INFLUENCES]
-            influence = np.linalg.solve(plain, equations.weighted[:INFLUENCES])
-            both = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
-            self.inflation = _inflation(self._images(both), self.correlation)
+        if self.inflation is None and self.influence is None and len(part):
+            some = part[:INFLUENCES]
+            influence = np.linalg.solve(equations.plain[some], equations.weighted[some])
+            self.influence = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
         return inverse
 
     def _images(self, windows: np.ndarray) -> NDArray[np.float64]:
@@ -410,6 +414,9 @@ class ShadowFit(ABC):
         elif measured.any():
             usual = float(np.median(noise[measured]))
         pooled = (noise * pixels + usual * pooled_freedom) / (pixels + pooled_freedom)
+        if self.influence is not None:
+            # Correlated noise of neighbouring pixels adds up.
+            self.inflation = _inflation(self._images(self.influence), self.correlation)
         by_correlation = ((self.inflation or 1.0) - 1) * self.noise_sigma**2
         factor = np.sqrt(np.maximum(pooled, usual))
         # Where shadows touch, the model errs by more than the noise of the pixels suggests.

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from ..errors import DataError
 from ..findings import Kind
 from .discs import set_apart
-from .light import Light, Noise, clipped_at, estimate_noise, vertex
+from .light import COARSE_BLUR, Light, Noise, clipped_at, estimate_noise, vertex, wide_blur
 
 MIN_SIZE = 32  # smallest side of an image [px]
 SCALES = (1.1, 1.5, 2.1, 3.0, 4.2, 6.0, 8.5, 12.0, 17.0)  # standard deviations of the blur [px]
@@ -45,7 +45,6 @@ MANY = 4 * MOST_TYPICAL  # number of beads from which the middle quarter of an i
 SEEN_SHARE = 0.5  # expected share of the beads of a phantom that every image shows
 BACKGROUND = 8.0  # blur of the light around a bead, over its scale
 PIXELS_AT_ONCE = 2**16  # pixels filtered at once: four such arrays fit into a cache of 1 MiB
-COARSE_BLUR = 4.0  # blur from which a coarser image has the same blur within 1 %
 FIELD_BLUR_PX = 4.0  # least blur of the image from which the field is found
 FIELD_LEVEL = 0.18  # level below which there is no field, as a fraction of the light in the field
 MAX_PARTS = 8  # largest number of parts into which plates cut the field
@@ -261,7 +260,7 @@ class _Sight:
 
 def field_of_view(light: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:
     """Return the mask (h, w) of the field of view: where there is light, with holes filled."""
-    smooth = cv2.GaussianBlur(light, (0, 0), max(FIELD_BLUR_PX, 2 * scale))
+    smooth = wide_blur(light, max(FIELD_BLUR_PX, 2 * scale), COARSE_BLUR / 2)
     stride = int(FIELD_BLUR_PX)  # pixels across which the blurred image hardly changes
     low, high = map(float, np.percentile(smooth[::stride, ::stride], [1, 95]))
     mask = (smooth > low + FIELD_LEVEL * (high - low)).astype(np.uint8)
@@ -401,14 +400,8 @@ def _blobs(
 
 
 def _background(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
-    """Return the blur of an image (h, w) over many beads of a scale, from a coarser image."""
-    blur = BACKGROUND * scale
-    factor = max(1, int(blur / COARSE_BLUR))
-    height, width = grey.shape
-    size = (max(1, width // factor), max(1, height // factor))
-    coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    smooth = cv2.GaussianBlur(coarse, (0, 0), blur / factor)
-    return cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR)
+    """Return the blur of an image (h, w) over many beads of a scale."""
+    return wide_blur(grey, BACKGROUND * scale, COARSE_BLUR)
 
 
 def _light_around(light: np.ndarray, scale: float) -> np.ndarray:

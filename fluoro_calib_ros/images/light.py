@@ -39,6 +39,8 @@ MAX_SLOW = 0.9  # largest share of slow changes; beyond it the noise is not visi
 # centimetres in a field of 20 to 40 cm.
 SURROUNDINGS = 1 / 16
 STRIDE = 8  # pixels over which that light hardly changes
+# Blur from which a coarser image has the same blur within 1 %; within 4 % from half of it.
+COARSE_BLUR = 4.0
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,16 @@ class Light:
         small = cv2.resize(self.grey, size, interpolation=cv2.INTER_AREA)
         width = SURROUNDINGS * max(small.shape)
         return cv2.GaussianBlur(small, (0, 0), width, borderType=cv2.BORDER_REPLICATE)
+
+
+def wide_blur(grey: NDArray[np.float32], blur: float, coarsest: float) -> NDArray[np.float32]:
+    """Return a blurred image (h, w), from one so coarse that the blur is at least `coarsest`."""
+    factor = max(1, int(blur / coarsest))
+    height, width = grey.shape
+    size = (max(1, width // factor), max(1, height // factor))
+    coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(coarse, (0, 0), blur / factor)
+    return cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:
@@ -144,14 +156,16 @@ def _correlation(light: NDArray[np.float32], field: NDArray[np.bool_]) -> NDArra
     # A blur mirrors the light at its border, where a slope would look like noise.
     edge = min(9 * LAGS, top, left)
     wider = light[top - edge : height - top + edge, left - edge : width - left + edge]
-    residual = wider - cv2.GaussianBlur(wider, (0, 0), 3 * LAGS)
+    residual = wider - wide_blur(wider, 3 * LAGS, COARSE_BLUR)
     residual = residual[edge : edge + height - 2 * top, edge : edge + width - 2 * left]
     field = field[top : height - top, left : width - left]
     white = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
     white[LAGS, LAGS] = 1
     if np.count_nonzero(field) < MIN_PIXELS:
         return white
-    limit = 3 * 1.4826 * float(np.median(np.abs(residual[field])))
+    chosen = residual[field]
+    chosen = chosen[:: len(chosen) // SAMPLED + 1]
+    limit = 3 * 1.4826 * float(np.median(np.abs(chosen)))
     valid = (field & (np.abs(residual) < limit)).astype(np.float32)
     valid = cv2.erode(valid, np.ones((3, 3), np.uint8))
     residual = residual * valid

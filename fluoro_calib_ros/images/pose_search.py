@@ -16,11 +16,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
+from .texture import window_offsets
 
 MIN_SINE = 0.3  # least sine of the angle between the sides of a triple of the phantom
 MIN_IMAGE_SINE = 0.2  # least sine of the angle between the sides of three beads in the image
@@ -143,12 +144,11 @@ def nearby_map(
 ) -> NDArray[np.uint8]:
     """Return a mask (h, w) of uint8: 1 within a distance of a pixel (n, 2), else 0."""
     width, height = image_size
-    empty = np.full((height, width), 255, dtype=np.uint8)
-    places = np.rint(uv).astype(int)
-    inside = ((places >= 0) & (places < (width, height))).all(axis=1)
-    empty[places[inside, 1], places[inside, 0]] = 0
-    distance = cv2.distanceTransform(empty, cv2.DIST_L2, 5)
-    return (distance <= reach_px).astype(np.uint8)
+    places = np.rint(uv).astype(int)[:, None] + window_offsets(reach_px)
+    places = places[((places >= 0) & (places < (width, height))).all(axis=2)]
+    nearby = np.zeros((height, width), dtype=np.uint8)
+    nearby[places[:, 1], places[:, 0]] = 1
+    return nearby
 
 
 def local_poses(

@@ -117,6 +117,7 @@ class BeadFit(ShadowFit):
         )
         self.radius = self.stretch * self.size
         self.disturbed = np.zeros(len(uv), dtype=bool)
+        self.settled = np.zeros(len(uv), dtype=bool)
         self.moved = np.zeros(len(uv))  # RMS shift of u and v by relative errors 1 of radii [px]
         self.residual = np.zeros((len(uv), len(self.offset)), dtype=np.float32)  # at the last step
         self.counted = np.zeros(self.residual.shape, dtype=bool)
@@ -158,8 +159,8 @@ class BeadFit(ShadowFit):
     def run(self, steps: int) -> None:
         """Take Gauss-Newton steps.
 
-        Converged beads only take part after changes to the model of their window, and those with
-        neighbours in the last step.
+        Converged beads only take part in the last step if they have neighbours, and after changes
+        to the model of their window.
         """
         active = np.ones(len(self.uv), dtype=bool)
         for step in range(steps):
@@ -173,10 +174,11 @@ class BeadFit(ShadowFit):
                 (rows[taken], near[taken]) for (rows, near), taken in zip(self.groups, taking_part)
             ]
             moved = [self._step(rows, near, final) for rows, near in groups]
-            for (rows, _), (uv, depth, background) in zip(groups, moved):
+            for (rows, near), (uv, depth, background) in zip(groups, moved):
                 lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
                 self.usable[rows[lost]] = False
-                active[rows] = (np.abs(uv - self.uv[rows]) > SETTLED_PX).any(axis=1)
+                moves = (np.abs(uv - self.uv[rows]) > SETTLED_PX).any(axis=1)
+                active[rows] = moves if near.shape[1] else ~self.settled[rows]
                 kept = rows[~lost]
                 self.uv[kept] = uv[~lost]
                 self.depth[kept] = depth[~lost]
@@ -200,7 +202,7 @@ class BeadFit(ShadowFit):
             if touching.any():
                 chosen = rows[touching]
                 members = np.concatenate([chosen[:, None], near[touching, :2]], axis=1)
-                self.crossing[chosen] = self._crossing(chosen, members)
+                self.crossing[chosen] = _crossing(self, chosen, members)
                 crossed[chosen] = True
         return crossed
 
@@ -210,43 +212,6 @@ class BeadFit(ShadowFit):
         radii = self.profile.radius_px * (self.radius[rows, None] + self.radius[near])
         reach = radii + 2 * self.profile.blur_px
         return np.asarray(((near >= 0) & (apart < reach)).any(axis=1))
-
-    def _crossing(
-        self, rows: NDArray[np.int64], members: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
-        """Return differences (g, m) in windows of beads (g,) with members (g, k), -1 for none."""
-        grid = FineGrid(self.offset, self.profile)
-        axis = grid.axis
-        raw = np.ones((len(rows), len(axis), len(axis)), dtype=DTYPE)
-        blurred = np.ones((len(rows), len(self.offset)))
-        window = np.arange(len(rows))[:, None, None]
-        for column in members.T:
-            there = column >= 0
-            bead = np.where(there, column, 0)
-            centre = self.uv[bead] - self.middle[rows]
-            depth = self.depth[bead] * there
-            # The points of a square that contains the bead.
-            count = min(int(2 * FINE * self._extent_px(bead).max()) + 3, len(axis))
-            first = np.rint((centre - axis[0]) * FINE).astype(int) - count // 2
-            place = np.clip(first, 0, len(axis) - count)[..., None] + np.arange(count)
-            x, y = np.moveaxis(axis[place] - centre[..., None], 1, 0).astype(DTYPE)
-            size = self.size[bead, None, None]
-            squared = self._squared(bead, x[:, None], y[:, :, None]) / size**2
-            absorbed = self.profile.absorbed(squared.astype(DTYPE), size.astype(DTYPE))
-            points = window, place[:, 1, :, None], place[:, 0, None]
-            raw[points] *= 1 - depth[:, None, None] * absorbed
-            x, y = np.moveaxis(self.offset - centre[:, None], 2, 0)
-            away = np.sqrt(self._squared(bead, x, y))
-            blurred *= 1 - depth[:, None] * self.shadows.shadow(away, self.kind[bead])[0]
-        out = np.empty_like(blurred)
-        for number, image in enumerate(raw):
-            out[number] = grid.blurred(image)
-        return out - blurred
-
-    def _extent_px(self, beads: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return distances (g,) from the centres beyond which beads absorb no light [px]."""
-        widest = np.linalg.inv(self.metric[beads])[:, [0, 1], [0, 1]].max(axis=1)
-        return np.asarray(self.profile.radius_px * self.size[beads] * np.sqrt(widest))
 
     def _squared(
         self, beads: NDArray[np.int64], x: NDArray[np.float64], y: NDArray[np.float64]
@@ -306,10 +271,10 @@ class BeadFit(ShadowFit):
         final: bool,
     ) -> np.ndarray:
         step = np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
-        noted = np.full(len(rows), final)
-        if not near.shape[1]:
-            noted |= (np.abs(step[:, TERMS : TERMS + 2]) <= SETTLED_PX).all(axis=1)
-        part = np.flatnonzero(noted)
+        # The step reduces the squared residuals by its product with the right side.
+        self.settled[rows] = (np.abs(step[:, TERMS : TERMS + 2]) <= SETTLED_PX).all(axis=1)
+        self.settled[rows] &= (step * equations.right).sum(axis=1) <= self.misfit[rows]
+        part = np.flatnonzero(final | (self.settled[rows] & (near.shape[1] == 0)))
         self._note_precision(rows, equations, part)
         self.residual[rows[part]] = equations.residual[part]
         self.counted[rows[part]] = equations.valid[part]
@@ -399,6 +364,45 @@ class BeadFit(ShadowFit):
         light = self.valid[rows] & (away > reach)
         seen = light & (self.grey[rows] < self.high)
         return np.asarray(seen.sum(axis=1) < SEEN_LIGHT * light.sum(axis=1))
+
+
+def _crossing(
+    fit: BeadFit, rows: NDArray[np.int64], members: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return differences (g, m) in windows of beads (g,) with members (g, k), -1 for none."""
+    grid = FineGrid(fit.offset, fit.profile)
+    axis = grid.axis
+    raw = np.ones((len(rows), len(axis), len(axis)), dtype=DTYPE)
+    blurred = np.ones((len(rows), len(fit.offset)))
+    window = np.arange(len(rows))[:, None, None]
+    for column in members.T:
+        there = column >= 0
+        bead = np.where(there, column, 0)
+        centre = fit.uv[bead] - fit.middle[rows]
+        depth = fit.depth[bead] * there
+        # The points of a square that contains the bead.
+        count = min(int(2 * FINE * _extent_px(fit, bead).max()) + 3, len(axis))
+        first = np.rint((centre - axis[0]) * FINE).astype(int) - count // 2
+        place = np.clip(first, 0, len(axis) - count)[..., None] + np.arange(count)
+        x, y = np.moveaxis(axis[place] - centre[..., None], 1, 0).astype(DTYPE)
+        size = fit.size[bead, None, None]
+        squared = fit._squared(bead, x[:, None], y[:, :, None]) / size**2
+        absorbed = fit.profile.absorbed(squared.astype(DTYPE), size.astype(DTYPE))
+        points = window, place[:, 1, :, None], place[:, 0, None]
+        raw[points] *= 1 - depth[:, None, None] * absorbed
+        x, y = np.moveaxis(fit.offset - centre[:, None], 2, 0)
+        away = np.sqrt(fit._squared(bead, x, y))
+        blurred *= 1 - depth[:, None] * fit.shadows.shadow(away, fit.kind[bead])[0]
+    out = np.empty_like(blurred)
+    for number, image in enumerate(raw):
+        out[number] = grid.blurred(image)
+    return out - blurred
+
+
+def _extent_px(fit: BeadFit, beads: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return distances (g,) from the centres beyond which beads absorb no light [px]."""
+    widest = np.linalg.inv(fit.metric[beads])[:, [0, 1], [0, 1]].max(axis=1)
+    return np.asarray(fit.profile.radius_px * fit.size[beads] * np.sqrt(widest))
 
 
 def scatter_equation(fit: BeadFit, count: int) -> tuple[float, float]:

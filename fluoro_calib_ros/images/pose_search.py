@@ -144,7 +144,9 @@ def nearby_map(
 ) -> NDArray[np.uint8]:
     """Return a mask (h, w) of uint8: 1 within a distance of a pixel (n, 2), else 0."""
     width, height = image_size
-    places = np.rint(uv).astype(int)[:, None] + window_offsets(reach_px)
+    places = np.rint(uv).astype(int)
+    places = places[((places >= 0) & (places < (width, height))).all(axis=1)]
+    places = places[:, None] + window_offsets(reach_px)
     places = places[((places >= 0) & (places < (width, height))).all(axis=2)]
     nearby = np.zeros((height, width), dtype=np.uint8)
     nearby[places[:, 1], places[:, 0]] = 1

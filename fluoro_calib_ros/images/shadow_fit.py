@@ -365,11 +365,7 @@ class ShadowFit(ABC):
     def typical(self) -> float:
         """Return the median lack of fit of the usable beads."""
         values = self.misfit[self.usable & np.isfinite(self.misfit)]
-        if not len(values):
-            return 1.0
-        values.sort()
-        half = len(values) // 2
-        return float(values[half] if len(values) % 2 else values[half - 1 : half + 1].mean())
+        return _median(values) if len(values) else 1.0
 
     def _note_precision(
         self, rows: NDArray[np.int64], equations: NormalEquations, part: NDArray[np.int64]
@@ -381,10 +377,8 @@ class ShadowFit(ABC):
         inverse = np.linalg.inv(equations.matrix[part])
         self.sigma[rows[part]] = self.noise_sigma[rows[part]] = _sd_of_centre(inverse)
         textured = part[self.texture.strength[rows[part]] > 0]
-        if len(textured):
-            self.noise_sigma[rows[textured]] = _sd_of_centre(
-                np.linalg.inv(equations.plain[textured])
-            )
+        plain = np.linalg.inv(equations.plain[textured])
+        self.noise_sigma[rows[textured]] = _sd_of_centre(plain)
         if self.inflation is None and self.influence is None and len(part):
             some = part[:INFLUENCES]
             influence = np.linalg.solve(equations.plain[some], equations.weighted[some])
@@ -406,22 +400,21 @@ class ShadowFit(ABC):
         noise: (n,) part of the lack of fit that is noise; None for all of it.
         """
         pixels = self.valid.sum(axis=1)
-        pooled_freedom = self.settings.pooled
         # The noise of one window is known to about 10 %; pooling with all windows helps.
         usual = typical
         if noise is None:
             noise = self.misfit
         elif measured.any():
             usual = float(np.median(noise[measured]))
-        pooled = (noise * pixels + usual * pooled_freedom) / (pixels + pooled_freedom)
+        freedom = self.settings.pooled
+        pooled = (noise * pixels + usual * freedom) / (pixels + freedom)
         if self.influence is not None:
             # Correlated noise of neighbouring pixels adds up.
             self.inflation = _inflation(self._images(self.influence), self.correlation)
         by_correlation = ((self.inflation or 1.0) - 1) * self.noise_sigma**2
         factor = np.sqrt(np.maximum(pooled, usual))
         # Where shadows touch, the model errs by more than the noise of the pixels suggests.
-        touching = self.distance < 2 * self.profile.radius_px
-        factor = np.where(touching, self.settings.crossed * factor, factor)
+        factor[self.distance < 2 * self.profile.radius_px] *= self.settings.crossed
         sigma = np.sqrt(self.sigma**2 + by_correlation) * factor
         # The noise of holes in a sheet does not increase with the inverted light: they are not
         # shadows that attenuate it.
@@ -441,6 +434,13 @@ class ShadowFit(ABC):
 def _within(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
     """Return values between bounds: like np.clip, in a third of its time for a few values."""
     return np.minimum(np.maximum(values, low), high)
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    """Return the median: like np.median, in a third of its time for a few values."""
+    ordered = np.sort(values)
+    half = len(ordered) // 2
+    return float(ordered[half] if len(ordered) % 2 else ordered[half - 1 : half + 1].mean())
 
 
 def _inflation(influence: NDArray[np.float64], correlation: NDArray[np.float64]) -> float:

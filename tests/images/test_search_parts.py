@@ -141,7 +141,7 @@ def test_what_is_near_a_bead_is_marked():
     near = nearby_map(uv, (20, 19), 2.2)
     v, u = np.mgrid[:19, :20]
     far = np.min([np.hypot(u - 10, v - 5), np.hypot(u - 2, v - 18)], axis=0)
-    np.testing.assert_array_equal(near, far <= 2.3)
+    np.testing.assert_array_equal(near, far <= 2.2)
     assert near.dtype == np.uint8
 
 

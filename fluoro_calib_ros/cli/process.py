@@ -446,7 +446,9 @@ def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[s
     for joint, angles in document['joints'].items():
         for name, angle in angles.items():
             cells |= {f'{joint}_{name}_{key}': angle[key] for key in ('range_deg', 'sd_deg')}
-    doubtful = [finding['sentence'] for finding in document['findings']]
+    doubtful = [
+        finding['sentence'] for finding in document['findings'] if finding['severity'] != 'note'
+    ]
     if doubtful and row['verdict'] == 'pass':
         cells |= {'verdict': 'cannot tell', 'cause': '; '.join(doubtful)}
     return cells

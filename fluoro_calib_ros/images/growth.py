@@ -96,23 +96,12 @@ def start_view(pose: LocalPose, lens: Lens, xyz: NDArray[np.float64]) -> View:
     rotation = _turn_to(ray) @ pose.rotation
     # The scale applies perpendicular to the ray, at the length of the ray.
     sensor = ray * (c / pose.scale)
-    position = xyz[pose.bead] - rotation.T @ sensor
-    view = View(
-        lens,
-        rotation,
-        position=position,
-        principal_distance_px=c,
-        coefficients=np.zeros((2, 0)),
-        degree=DEGREE,
-    )
-    expected = lens.expected(DEGREE)
-    # The image of the bead already contains the expected distortion.
     return View(
         lens,
-        view.rotation,
-        position=view.position,
+        rotation,
+        position=xyz[pose.bead] - rotation.T @ sensor,
         principal_distance_px=c,
-        coefficients=expected,
+        coefficients=lens.expected(DEGREE),
         degree=DEGREE,
     )
 

@@ -251,16 +251,14 @@ def is_evident(best: Match) -> bool:
 
 def _check_evidence(best: Match) -> None:
     """Raise DataError if too few predicted beads are found or too few detections are predicted."""
-    enough_found = best.explained < MIN_EXPLAINED or is_evident(best)
-    if not enough_found or len(best.bead) < MIN_BEADS:
+    if is_evident(best) and len(best.bead) >= MIN_BEADS:
+        return
+    cause = f'explains only {best.explained:.0%} of the beads in the image'
+    if best.explained >= MIN_EXPLAINED or len(best.bead) < MIN_BEADS:
         cause = (
             f'predicts {best.expected} beads in the image, of which only {best.found:.0%} are '
             'found'
         )
-    elif best.explained < MIN_EXPLAINED:
-        cause = f'explains only {best.explained:.0%} of the beads in the image'
-    else:
-        return
     raise DataError(
         f'the best pose of the phantom {cause}',
         kind=Kind.POSE_UNSURE,

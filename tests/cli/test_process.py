@@ -299,7 +299,10 @@ def test_doubt_about_a_body_makes_a_trial_doubtful():
         document = {
             'bodies': {'tibia': {'poses': 5, 'sd_mm': 0.1, 'sd_deg': 0.2}},
             'joints': {'knee': {'flexion': {'range_deg': 30.0, 'sd_deg': 0.1}}},
-            'findings': [{'sentence': 'marker 3 has moved'}],
+            'findings': [
+                {'sentence': 'marker 3 has moved', 'severity': 'warning'},
+                {'sentence': 'marker 4 is near marker 5', 'severity': 'note'},
+            ],
         }
 
     row = trial_row('walk', 'pass', [(Bodies, Given)])

@@ -36,10 +36,12 @@ def test_linter_is_content(command):
 
 
 @pytest.mark.long
+@pytest.mark.timeout(900)
 def test_types_are_right():
     """Run mypy without garbage collection, which takes a sixth of its time and finds little.
 
-    mypy's cache is used, so that only the first run after a change of all files takes a minute.
+    mypy's cache is used, so that only the first run after a change of all files takes a minute; on
+    a machine that other programs use as well, it takes several.
     """
     code = (
         'import gc; gc.disable(); gc.enable = gc.disable; '

@@ -49,6 +49,12 @@ VERDICTS = {
 MAX_ROWS = 40  # maximum rows in the lists of outliers and correlations
 MAX_ARROWS = 30_000  # maximum number of residuals in all exposures; they take a megabyte
 MAX_RADIOGRAPHS_BYTES = 3_000_000  # of all exposures together; 4 MB in the report
+# The table of the report has the residuals of each fluoroscope's own adjustments.
+RESIDUALS = (
+    'Residuals by column and row, to the beads as all fluoroscopes together determine them. Those '
+    'before the correction are larger than in an adjustment without it, as the orientations are '
+    'those of the calibration'
+)
 
 
 @dataclass(frozen=True)
@@ -325,7 +331,7 @@ def _figures(
         figures.append(('Distortion and its standard deviation', field_figure))
     if residuals.inlier.any():
         figures += [
-            ('Residuals by column and row', residuals.by_position(name, size)),
+            (RESIDUALS, residuals.by_position(name, size)),
             ('Residuals and coverage', residual_map(residuals, name, size)),
             ('RMS and number of beads by exposure', exposure_bars(residuals, name)),
             ('Distribution of the residuals', distribution(residuals, name)),

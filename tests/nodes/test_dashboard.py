@@ -224,6 +224,14 @@ def test_light_is_the_worst_or_what_is_to_be_done_next(changes, level, word):
     assert shown.sentence
 
 
+@pytest.mark.parametrize(
+    'verdict, said', [('', 'no verdict in this session'), ('pass', 'verdict: pass')]
+)
+def test_a_calibrated_rig_says_whether_it_has_a_verdict(verdict, said):
+    state = SessionState(fluoroscopes=CALIBRATED, nodes=(GOOD,), verdict=verdict)
+    assert said in light(state).sentence
+
+
 def test_a_broken_node_comes_before_everything_else():
     broken = NodeState('calibration_node', 'error', 'disk full')
     state = SessionState(

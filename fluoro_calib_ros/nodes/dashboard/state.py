@@ -185,5 +185,7 @@ def light(state: SessionState) -> Light:
         return Light(
             'warn', 'Attention', 'the checks cannot decide whether the calibration is good'
         )
+    # A calibration that was loaded has its verdict in its report.
+    verdict = f'verdict: {state.verdict}' if state.verdict else 'no verdict in this session'
     drift = f'; drift: {state.drift}' if state.drift else ''
-    return Light('ok', 'OK', f'calibrated{drift}')
+    return Light('ok', 'OK', f'calibrated, {verdict}{drift}')

@@ -24,7 +24,7 @@ from .profile import LIMITS, MASKED, PLAIN, SHAPE, Profile, fit_profile
 from .shadow_fit import DISTURBED, ShadowFit
 
 PROFILE_STEPS = 3
-PROFILE_BEADS = 50  # largest number of beads for the profile
+PROFILE_BEADS = 100  # largest number of beads for the profile
 # Rounds without a better fit, after which the best profile is chosen in windows of equal size: a
 # hard edge with a wide blur looks like a sphere. If the radius grows by a half, fits get worse
 # before they get better.

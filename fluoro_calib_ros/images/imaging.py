@@ -40,6 +40,9 @@ START_MASK_PX = 3.0
 # four images with a mask of factor 1.5 and 3 px, and at most .15 in 41 images without one but in
 # one, whose profile was not the best.
 COMMON = 0.15
+# Share of clipped pixels around isolated shadows from which no mask is searched for: the bright
+# borders that it gives them are clipped first.
+CLIPPED = 0.01
 MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image
 # Largest lack of fit with a mask over that without one. It was .43 to .88 in seven images with a
 # mask whose parameters were found, and .98 in one where they were not.
@@ -220,16 +223,20 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     close = distance < 2 * imaging.profile.reach_px
     alone = shadows.seen & np.isfinite(size) & (distance > 2 * start.reach_px)
     rows = _sampled(np.flatnonzero(alone), SAMPLE)
-    if len(rows) < FEW or not close.any() or np.isfinite(light.high):
+    if len(rows) < FEW or not close.any():
         return imaging
     shapes = shadows.shape[rows], size[rows]
     fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)
-    if np.median(fit.common_share()) < COMMON:
+    clipped = np.mean(fit.grey[fit.valid] >= light.high)
+    if clipped > CLIPPED or np.median(fit.common_share()) < COMMON:
         return imaging
     isolated = replace(shadows, alone=alone)
-    profile = _typical(
-        light, isolated, imaging.size, start.radius_px, start=start, estimated=MASKED
-    )
+    profile = start
+    # Far from the right mask, a share of scattered light that is estimated with it runs away.
+    for estimated in (MASKED, (*MASKED, 'scatter')):
+        profile = _typical(
+            light, isolated, imaging.size, start.radius_px, start=profile, estimated=estimated
+        )
     if profile.sharpening < MIN_SHARPENING:
         profile = replace(profile, sharpening=0.0, mask_px=0.0)
     plain, masked = (

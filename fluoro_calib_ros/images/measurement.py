@@ -239,7 +239,10 @@ class BeadFit(ShadowFit):
         shadow *= there[..., None]
         slope *= there[..., None] / np.maximum(distance, 1e-6)
         depth = self.depth[everyone].astype(np.float32)[..., None]
-        passed = np.maximum(1 - depth * shadow, np.float32(MIN_PASSED))
+        passed = 1 - depth * shadow
+        # An unsharp mask may leave less than no light. A product is divided by each share.
+        size = np.abs(passed) if self.profile.sharpening else passed
+        passed[size < MIN_PASSED] = MIN_PASSED
         product = np.prod(passed, axis=1)
         direct = self.background.direct(rows)
         behind = direct * (product + self._crossing_in(rows))

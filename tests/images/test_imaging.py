@@ -425,12 +425,16 @@ def test_scattered_light_stays_where_shadows_are_not_those_of_spheres():
     assert imaging.profile == _typical(light, shadows, np.ones(36), RADIUS)
 
 
-@pytest.mark.parametrize('factor', [0.0, 1.5])
-def test_an_unsharp_mask_is_estimated_if_there_is_one(factor):
-    """Isolated shadows tell it; those that touch move apart without it."""
-    image, shadows = radiograph_of_pairs(0.1, 10_000)
+@pytest.mark.parametrize(
+    ('factor', 'scatter', 'clipped'), [(0.0, 0.1, 0), (1.5, 0.1, 0), (1.5, 0.02, 50)]
+)
+def test_an_unsharp_mask_is_estimated_if_there_is_one(factor, scatter, clipped):
+    """Isolated shadows tell it; those that touch move apart without it. Few pixels are clipped."""
+    image, shadows = radiograph_of_pairs(scatter, 10_000)
     image = image + factor * (image - cv2.GaussianBlur(image, (0, 0), 2.5))
-    light = Light(image, np.ones(image.shape, bool))
+    high = np.sort(image, axis=None)[-1 - clipped] if clipped else np.inf
+    image = np.minimum(image, high)
+    light = Light(image, np.ones(image.shape, bool), high=high)
     noise = estimate_noise(image, light.field)
     imaging = first_imaging(light, noise, shadows, RADIUS, size=np.ones(36))
     profile = imaging.profile
@@ -445,6 +449,23 @@ def test_an_unsharp_mask_is_estimated_if_there_is_one(factor):
     without = measure_beads(light, shadows.uv, shadows.shape, plain, noise)
     errors = [np.sqrt(np.mean((one.uv - shadows.uv)[20:] ** 2)) for one in (beads, without)]
     assert errors[0] < 0.5 * errors[1]
+
+
+def test_an_unsharp_mask_may_leave_less_than_no_direct_light():
+    light = Light(np.full((60, 60), 1000.0, np.float32), np.ones((60, 60), bool))
+    for sharpening, mask_px in ((0.0, 0.0), (1.5, 2.5)):
+        profile = Profile(RADIUS, 1.2, 2.0, 0.1, sharpening, mask_px)
+        fit = BeadFit(light, np.array([[30.0, 30]]), circles(np.ones(1)), profile, NOISE)
+        fit.depth[:] = 1.1
+        ((rows, near),) = fit.groups
+        absorbed, _ = profile.shadow(np.linalg.norm(fit.offset, axis=1))
+        expected = 100 + 900 * (1 - 1.1 * absorbed)
+        model, _ = fit._model(rows, near)
+        assert expected.min() < 100
+        if not sharpening:
+            expected = np.maximum(expected, 100)
+        np.testing.assert_allclose(model[0], expected, atol=20)
+        assert (model.min() < 80) == bool(sharpening)
 
 
 def test_light_behind_two_beads_changes_with_the_scattered_light():

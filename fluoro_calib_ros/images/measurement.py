@@ -169,12 +169,10 @@ class BeadFit(ShadowFit):
             final = step == steps - 1
             if step in self.settings.crossing_steps:
                 active |= self._cross()
-            taking_part = [
-                active[rows] | (final and near.shape[1] > 0) for rows, near in self.groups
-            ]
-            groups = [
-                (rows[taken], near[taken]) for (rows, near), taken in zip(self.groups, taking_part)
-            ]
+            groups = []
+            for rows, near in self.groups:
+                chosen = active[rows] | (final and near.shape[1] > 0)
+                groups.append((rows[chosen], near[chosen]))
             moved = [self._step(rows, near, final) for rows, near in groups]
             for (rows, near), (uv, depth, background) in zip(groups, moved):
                 lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
@@ -241,8 +239,8 @@ class BeadFit(ShadowFit):
         depth = self.depth[everyone].astype(np.float32)[..., None]
         passed = 1 - depth * shadow
         # An unsharp mask may leave less than no light. A product is divided by each share.
-        size = np.abs(passed) if self.profile.sharpening else passed
-        passed[size < MIN_PASSED] = MIN_PASSED
+        magnitude = np.abs(passed) if self.profile.sharpening else passed
+        passed[magnitude < MIN_PASSED] = MIN_PASSED
         product = np.prod(passed, axis=1)
         direct = self.background.direct(rows)
         behind = direct * (product + self._crossing_in(rows))

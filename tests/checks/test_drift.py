@@ -565,6 +565,7 @@ def test_clusters_see_a_drift_along_the_epipolar_lines(name, quarter, direction)
     assert missed['warn'] == np.inf
 
 
+@pytest.mark.long
 def test_undetectable_drift_is_not_reported():
     """Shifting a whole image along the epipolar lines moves all points alike."""
     scene, watch, first = perfect()

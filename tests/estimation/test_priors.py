@@ -198,6 +198,7 @@ def normalized_squares(functions, error, covariances):
     return [np.mean((at @ error) ** 2 / np.sum(at @ c * at, axis=1)) for c in covariances]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('count', 'too_small'), [(40, (1.3, 1.7)), (400, (0.95, 1.15))])
 def test_claims_hold_where_the_signal_is_only_estimated(count, too_small):
     """With few image points, the most likely signal alone understates the errors."""

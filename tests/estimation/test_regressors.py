@@ -268,6 +268,7 @@ def test_calibration_with_a_user_regressor(tmp_path):
     assert loaded.grid.error_px < 1e-9 and loaded.grid.cell_px == 8
 
 
+@pytest.mark.long
 def test_random_regressor_gives_reproducible_results():
     """A single-output regressor with random_state=None is seeded, and fitted once per output."""
     regressor = DecisionTreeRegressor(max_features=1, min_samples_leaf=10)

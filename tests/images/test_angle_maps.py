@@ -150,6 +150,7 @@ def test_images_follow_a_field_that_was_estimated_from_exposures():
         assert rms(error) < 0.3 * rms(change) and rms(error) < 0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'size, worst', [((1000, 703), LIMIT_PX), ((333, 1024), LIMIT_PX), ((70, 45), 0.3)]
 )

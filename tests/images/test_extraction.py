@@ -68,6 +68,7 @@ def test_free_beads_are_found_and_no_match_is_false():
     assert np.isin(np.flatnonzero(free), found.bead).mean() > 0.95
 
 
+@pytest.mark.long
 def test_centres_are_as_precise_as_their_sigma_says():
     found = extraction()
     _, true, _ = radiograph()

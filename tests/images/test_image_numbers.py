@@ -211,6 +211,7 @@ def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others(
         assert (3 in checked().bead) is is_kept
 
 
+@pytest.mark.long
 def test_chance_of_a_wrong_centre_is_that_of_errors_with_such_a_residual():
     rng = np.random.default_rng(4)
     sigma, scatter = 0.2, 0.12

@@ -178,6 +178,7 @@ def test_ids_are_right_or_doubtful_through_crossings_and_occlusions():
         assert len(away) > 0.85 * (FRAMES * len(ids) - hidden[name])
 
 
+@pytest.mark.long
 def test_centres_are_as_precise_as_their_sigma_says():
     for name in 'ab':
         away, sigma, _ = errors(name, followed(name))

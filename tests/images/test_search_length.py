@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from rigs import refused
 from scipy.spatial.transform import Rotation
 
@@ -48,6 +49,7 @@ def test_a_phantom_whose_shadows_would_all_be_one_is_not_looked_for():
     assert enough_seeds(sheet, 80, 6.5, NEIGHBOURS) == 0
 
 
+@pytest.mark.long
 def test_a_phantom_is_found_where_all_its_faces_are_seen_from_the_edge():
     v, u = np.mgrid[:1024, :1024]
     field = np.hypot(u - 511.5, v - 511.5) < 490
@@ -78,6 +80,7 @@ def test_few_beads_are_found_though_perspective_moves_the_far_ones():
         np.testing.assert_array_equal(there[found.detection[own]], found.bead[own])
 
 
+@pytest.mark.long
 def test_another_phantom_is_refused_after_as_many_beads_as_would_tell(monkeypatch):
     tried = []
 

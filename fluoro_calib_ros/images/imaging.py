@@ -40,8 +40,8 @@ START_MASK_PX = 3.0
 # four images with a mask of factor 1.5 and 3 px, and at most .15 in 41 images without one but in
 # one, whose profile was not the best.
 COMMON = 0.15
-# Share of clipped pixels in windows of isolated shadows from which no mask is searched for. It was at
-# most 0.0004 in three images where a mask had bright borders clipped, and is 0.3 and more if the
+# Share of clipped pixels in windows of isolated shadows from which no mask is searched for. It was
+# at most 0.0004 in three images where a mask had bright borders clipped, and is 0.3 and more if the
 # background is clipped.
 CLIPPED = 0.01
 MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image

@@ -298,7 +298,7 @@ class Texture:
         examined = mean_square > noise
         ends = np.cumsum([len(part[0]) for part in parts])[:-1]
         spectra = [
-            self._spectra(NO_EDGE, tuple(values[own] for values in part))
+            self._spectra(NO_EDGE, _some(part, own))
             for part, own in zip(parts, np.split(examined, ends))
         ]
         strengths = Spectra.joined(spectra).strengths(excess, mean_square[~examined])
@@ -318,7 +318,7 @@ class Texture:
             spectra = []
             for one in np.unique(across[textured]).tolist():
                 own = order[across[textured] == one]
-                spectra.append(self._spectra(one, tuple(values[own] for values in part)))
+                spectra.append(self._spectra(one, _some(part, own)))
             edges = Spectra.joined(spectra).strengths_at(excess, strengths.scale)
             better = _likely(edges.evidence - evidence[textured])
             strength[rows[textured[better]]] = edges.variance[better]
@@ -336,6 +336,11 @@ class Texture:
         jacobian, relative, weight, residual = part
         cosines = _cosines_in(self.squared_px, across)
         return cosines.spectra(relative, jacobian, weight=weight, residual=residual)
+
+
+def _some(part: Part, windows: NDArray[np.int64] | NDArray[np.bool_]) -> Part:
+    jacobian, relative, weight, residual = part
+    return jacobian[windows], relative[windows], weight[windows], residual[windows]
 
 
 def _mean_squares(parts: Sequence[Part]) -> tuple[NDArray[np.floating], float]:
@@ -358,9 +363,7 @@ def _chosen(parts: Sequence[Part], chosen: NDArray[np.bool_]) -> Part:
     """Return the chosen windows (n,) of all parts; derivatives by missing unknowns are zero."""
     ends = np.cumsum([len(part[0]) for part in parts])[:-1]
     some = np.split(chosen, ends)
-    jacobians, *others = zip(
-        *(tuple(values[own] for values in part) for part, own in zip(parts, some))
-    )
+    jacobians, *others = zip(*(_some(part, own) for part, own in zip(parts, some)))
     relative, weight, residual = (np.concatenate(arrays) for arrays in others)
     return _padded(jacobians), relative, weight, residual
 

@@ -36,7 +36,6 @@ EDGE = 10.0
 STEP = 4.0
 RATIOS = STEP ** np.arange(-2, 7)
 ROUNDS = 3  # iterations over the strengths and the factor on the noise
-QUARTILE = 0.6745  # that of the normal distribution
 EM_STEPS = 30  # iterations after which the share of windows has converged to 0.01
 # Directions across edges that are tried, 7.5 degrees apart: at the border of a window, an edge is
 # then off by less than its blur. NO_EDGE: the background has no straight edge.
@@ -194,12 +193,11 @@ class Spectra:
             **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         )
 
-    def strengths(self, excess: float, plain: NDArray[np.floating] | tuple[()] = ()) -> Strengths:
+    def strengths(self, excess: float) -> Strengths:
         """Return the variances of the backgrounds, 0 for windows that more likely have none.
 
         The share of windows with a background and a common factor on the noise are estimated with
-        the strengths. excess: variance of slow waves of the noise over that of white noise. plain:
-        (k,) mean squared residuals of windows that have no background.
+        the strengths. excess: variance of slow waves of the noise over that of white noise.
         """
         log_det, explained = self._marginals(excess)
         squared = self.products[:, -1, -1]
@@ -208,10 +206,10 @@ class Spectra:
         best = np.zeros(len(squared), dtype=int)
         for _ in range(ROUNDS):
             mean_square = (squared - np.where(likely, explained[best, window], 0.0)) / self.freedom
-            scale = float(np.median(np.append(mean_square, plain)))
+            scale = float(np.median(mean_square))
             gain = 0.5 * (explained / (scale * excess) - log_det)
             best = np.argmax(gain, axis=0)
-            likely = _likely(_evidence(gain), len(plain))
+            likely = _likely(_evidence(gain))
         strengths = self._most_likely(gain, scale)
         return replace(strengths, variance=np.where(likely, strengths.variance, 0.0))
 
@@ -251,17 +249,16 @@ def _evidence(gain: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(logsumexp(gain, axis=0) - np.log(len(RATIOS)))
 
 
-def _likely(evidence: NDArray[np.float64], others: int = 0) -> NDArray[np.bool_]:
+def _likely(evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return (g,) whether windows are of a kind, given the log-evidence (g,) for it.
 
     Their share is unknown and estimated by expectation-maximisation (Dempster, Laird and Rubin, J.
-    R. Stat. Soc. B 39, 1977). others: number of other windows, which are not of that kind.
+    R. Stat. Soc. B 39, 1977).
     """
-    count = len(evidence) + others
-    min_share = 0.5 / count
+    min_share = 0.5 / len(evidence)
     odds = 0.0
     for _ in range(EM_STEPS):
-        share = np.sum(expit(evidence + odds)) / count
+        share = np.mean(expit(evidence + odds))
         odds = float(logit(np.clip(share, min_share, 1 - min_share)))
     return np.asarray(evidence + odds > 0)
 
@@ -290,37 +287,27 @@ class Texture:
     ) -> Texture:
         """Return the backgrounds that the windows in rows (n,) show.
 
-        Windows whose residuals are not larger than the noise have none. parts: those of the
-        windows in turn. angle: (n,) direction across a possible edge [rad]. excess: variance of
-        slow waves of the noise over that of white noise.
+        parts: those of the windows in turn. angle: (n,) direction across a possible edge [rad].
+        excess: variance of slow waves of the noise over that of white noise.
         """
-        mean_square, noise = _mean_squares(parts)
-        examined = mean_square > noise
-        ends = np.cumsum([len(part[0]) for part in parts])[:-1]
-        spectra = [
-            self._spectra(NO_EDGE, _some(part, own))
-            for part, own in zip(parts, np.split(examined, ends))
-        ]
-        strengths = Spectra.joined(spectra).strengths(excess, mean_square[~examined])
-        variance, evidence = np.zeros((2, len(rows)))
-        variance[examined] = strengths.variance
-        evidence[examined] = strengths.evidence
-        textured = np.flatnonzero(variance)
+        spectra = [self._spectra(NO_EDGE, part) for part in parts]
+        strengths = Spectra.joined(spectra).strengths(excess)
+        textured = np.flatnonzero(strengths.variance)
         strength = np.zeros_like(self.strength)
         direction = np.full_like(self.across, NO_EDGE)
-        strength[rows] = variance
+        strength[rows] = strengths.variance
         if len(textured):
             # Is a straight edge a better explanation than waves in all directions?
-            part = _chosen(parts, variance > 0)
+            part = _chosen(parts, strengths.variance > 0)
             across = np.rint(angle * (DIRECTIONS / np.pi)).astype(int) % DIRECTIONS
             order = np.argsort(across[textured], kind='stable')
             textured = textured[order]
             spectra = []
             for one in np.unique(across[textured]).tolist():
                 own = order[across[textured] == one]
-                spectra.append(self._spectra(one, _some(part, own)))
+                spectra.append(self._spectra(one, tuple(values[own] for values in part)))
             edges = Spectra.joined(spectra).strengths_at(excess, strengths.scale)
-            better = _likely(edges.evidence - evidence[textured])
+            better = _likely(edges.evidence - strengths.evidence[textured])
             strength[rows[textured[better]]] = edges.variance[better]
             direction[rows[textured[better]]] = across[textured[better]]
         return replace(self, strength=strength, across=direction)
@@ -338,32 +325,13 @@ class Texture:
         return cosines.spectra(relative, jacobian, weight=weight, residual=residual)
 
 
-def _some(part: Part, windows: NDArray[np.int64] | NDArray[np.bool_]) -> Part:
-    jacobian, relative, weight, residual = part
-    return jacobian[windows], relative[windows], weight[windows], residual[windows]
-
-
-def _mean_squares(parts: Sequence[Part]) -> tuple[NDArray[np.floating], float]:
-    """Return mean squared residuals (n,) of windows, and their median for noise alone.
-
-    The median follows from the lower quartile, as mean squares of f residuals scatter by
-    sqrt(2 / f): backgrounds of half of the windows do not change it.
-    """
-    sums = np.concatenate([(part[3] ** 2 * part[2]).sum(axis=1) for part in parts])
-    freedom = np.concatenate(
-        [np.count_nonzero(part[2], axis=1) - part[0].shape[1] for part in parts]
-    )
-    freedom = np.maximum(freedom, 1)
-    mean_square = sums / freedom
-    noise = np.quantile(mean_square / (1 - QUARTILE * np.sqrt(2 / freedom)), 0.25)
-    return mean_square, float(noise)
-
-
 def _chosen(parts: Sequence[Part], chosen: NDArray[np.bool_]) -> Part:
     """Return the chosen windows (n,) of all parts; derivatives by missing unknowns are zero."""
     ends = np.cumsum([len(part[0]) for part in parts])[:-1]
     some = np.split(chosen, ends)
-    jacobians, *others = zip(*(_some(part, own) for part, own in zip(parts, some)))
+    jacobians, *others = zip(
+        *(tuple(values[own] for values in part) for part, own in zip(parts, some))
+    )
     relative, weight, residual = (np.concatenate(arrays) for arrays in others)
     return _padded(jacobians), relative, weight, residual
 

@@ -41,8 +41,8 @@ START_MASK_PX = 3.0
 # one, whose profile was not the best.
 COMMON = 0.15
 # Share of clipped pixels in windows of isolated shadows from which no mask is searched for. It was
-# at most 0.0004 in three images where bright borders of a mask were clipped, and is 0.3 and more
-# if the background is clipped.
+# at most 0.0004 in three images where bright borders of a mask were clipped, and 0.56 to 0.64 in
+# six images with a clipped background.
 CLIPPED = 0.01
 MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image
 # Largest lack of fit with a mask over that without one. It was .43 to .88 in seven images with a

@@ -289,7 +289,7 @@ class BeadFit(ShadowFit):
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Whether beads (n,) have converged with a standard deviation."""
+        """Whether beads (n,) are usable and have a standard deviation."""
         return self.usable & np.isfinite(self.sigma)
 
     def _note_shifts(

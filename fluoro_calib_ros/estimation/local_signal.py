@@ -19,8 +19,10 @@ as in MacKay, "Bayesian interpolation", Neural Computation 4, 1992.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,35 +192,33 @@ class _Place:
 
 @dataclass(frozen=True)
 class _ShownBumps:
-    """Information of the image points on all bumps that an image may have.
-
-    nodes (n, 2) [px]; pulls (n, 2) and products (k, n, n), for u and v or one for both: q and s of
-    Tipping and Faul 2003.
-    """
+    """Information of the image points on all bumps that an image may have."""
 
     image_size: tuple[int, int]
-    nodes: NDArray[np.float64]
-    pulls: NDArray[np.float64]
-    products: NDArray[np.float64]
+    nodes: NDArray[np.float64]  #: (n, 2) [px]
+    pulls: NDArray[np.float64]  #: (n, 2) q of Tipping and Faul 2003
+    base: NDArray[np.float64]  #: (n, s) coefficients of the sines for each bump
+    #: (k, n, s) these coefficients times the evidence, for u and v or one for both
+    evidence: NDArray[np.float64]
 
     @classmethod
     def of(cls, functions: Functions, estimates: SineEstimates) -> _ShownBumps:
         """Return the information on the bumps from that on the sines."""
         nodes = _all_nodes(functions.image_size)
-        base = bumps(functions, nodes)
-        products = np.stack([base.T @ (evidence @ base) for evidence in estimates.evidence])
-        return cls(functions.image_size, nodes, base.T @ estimates.pull, products)
+        base = bumps(functions, nodes).T
+        pulls = base @ estimates.pull
+        return cls(functions.image_size, nodes, pulls, base, base @ estimates.evidence)
 
     def windows(self) -> list[_Place]:
         """Return all windows."""
-        return [self._place(rows) for rows in _windows(self.image_size, self.nodes)]
+        return self._places(_windows(self.image_size))
 
     def most_likely_band(self, used: NDArray[np.bool_]) -> _Place | None:
         """Return the band with the largest gain, without the used bumps (n,).
 
         Only the bands whose single bumps are least likely to be zero are examined.
         """
-        level = np.diagonal(self.products, axis1=1, axis2=2).T
+        level = np.sum(self.base * self.evidence, axis=2).T
         squares = self.pulls**2
         # A bump has level zero if no image point shows it.
         ratio = np.divide(squares, level, out=np.zeros_like(squares), where=level > 0)
@@ -228,16 +228,19 @@ class _ShownBumps:
         score = (bands @ np.where(used, 0.0, excess)) / np.sqrt(np.maximum(number, 1))
         score[number < NODES] = -np.inf
         best = np.argsort(score)[-LIKELY_BANDS:]
-        candidates = [
-            self._place(np.flatnonzero((bands[i] > 0) & ~used))
-            for i in best[score[best] > -np.inf]
-        ]
+        likely = bands[best[score[best] > -np.inf]]
+        candidates = self._places([np.flatnonzero((band > 0) & ~used) for band in likely])
         return max(candidates, key=lambda band: band.gain, default=None)
 
-    def _place(self, rows: NDArray[np.int64]) -> _Place:
-        """Return the place with some bumps (b,)."""
-        products = [product[np.ix_(rows, rows)] for product in self.products]
-        return _Place(rows, *_largest_gain(self.pulls[rows], products))
+    def _places(self, rows: Iterable[NDArray[np.int64]]) -> list[_Place]:
+        """Return the places with these bumps (b,), computing those of the same number at once."""
+        out = []
+        for _, same in groupby(sorted(rows, key=len), len):
+            chosen = np.stack(list(same))
+            products = self.base[chosen] @ np.swapaxes(self.evidence[:, chosen], 2, 3)
+            gain, variance = _largest_gains(self.pulls[chosen], products)
+            out += [_Place(*place) for place in zip(chosen, gain.tolist(), variance.tolist())]
+        return out
 
 
 def _all_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
@@ -247,13 +250,15 @@ def _all_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
     return np.stack(np.meshgrid(u, v, indexing='ij'), axis=-1).reshape(-1, 2)
 
 
-def _windows(image_size: tuple[int, int], nodes: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-    """Return the rows of the nodes (n, 2) [px] of each window."""
+@lru_cache(maxsize=4)
+def _windows(image_size: tuple[int, int]) -> tuple[NDArray[np.int64], ...]:
+    """Return the rows of the nodes of each window."""
+    nodes = _all_nodes(image_size)
     size = max(image_size) / WINDOWS
     count = [max(1, int(np.ceil(2 * side / size)) - 1) for side in image_size]
     corners = np.array(list(np.ndindex(*count))) * size / 2
     inside = ((nodes >= corners[:, None]) & (nodes < corners[:, None] + size)).all(axis=2)
-    return [np.flatnonzero(mask) for mask in np.asarray(inside) if np.any(mask)]
+    return tuple(np.flatnonzero(mask) for mask in np.asarray(inside) if np.any(mask))
 
 
 @lru_cache(maxsize=4)
@@ -269,23 +274,24 @@ def _bands(image_size: tuple[int, int]) -> NDArray[np.float64]:
     return np.concatenate(out).astype(float)
 
 
-def _largest_gain(
-    pulls: NDArray[np.float64], products: list[NDArray[np.float64]]
-) -> tuple[float, float]:
-    """Return the largest gain of the log likelihood by one more place, and its variance.
+def _largest_gains(
+    pulls: NDArray[np.float64], products: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the largest gains (w,) of the log likelihood by one more place, and its variances.
 
-    pulls (b, 2) and products (b, b), for u and v or one for both: q and s of Tipping and Faul 2003
-    for b bumps.
+    pulls (w, b, 2) and products (k, w, b, b), for u and v or one for both: q and s of Tipping and
+    Faul 2003 for the b bumps of each place.
     """
-    gain = np.zeros(len(VARIANCES))
-    solved = [np.linalg.eigh(product) for product in products]
-    for axis in (0, 1):
-        values, vectors = solved[min(axis, len(solved) - 1)]
-        values = VARIANCES[:, None] * np.maximum(values, 0)
-        squares = VARIANCES[:, None] * (vectors.T @ pulls[:, axis]) ** 2
-        gain += np.sum(squares / (1 + values) - np.log1p(values), axis=1) / 2
-    best = int(np.argmax(gain))
-    return float(gain[best]), float(VARIANCES[best])
+    level, vectors = np.linalg.eigh(products)
+    turned = np.swapaxes(vectors, 2, 3) @ np.moveaxis(pulls, 2, 0)[..., None]
+    level = np.maximum(level, 0)
+    gains = np.empty((len(VARIANCES), len(pulls)))
+    for number, variance in enumerate(VARIANCES):
+        grown = variance * level
+        explained = variance * turned[..., 0] ** 2 / (1 + grown)
+        gains[number] = np.sum(explained - np.log1p(grown), axis=(0, 2)) / 2
+    best = np.argmax(gains, axis=0)
+    return gains[best, np.arange(len(best))], VARIANCES[best]
 
 
 def _is_beside(nodes: NDArray[np.float64], others: NDArray[np.float64], reach: float) -> bool:

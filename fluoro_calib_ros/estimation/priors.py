@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, cho_factor, cho_solve, lapack
+from scipy.linalg import cho_factor, cho_solve, lapack
 
 from ..correction.series import Functions
 from ..correction.terms import ABSENT_VARIANCE, trend_transformation
@@ -257,7 +257,7 @@ def _signal_equations(
     columns = np.setdiff1d(np.arange(len(right)), trend)
     if prior.local is not None:
         base, right = _with_bumps(functions, base, right, prior.local)
-    return SignalEquations(functions.frequency, base, right, columns)
+    return SignalEquations(functions.frequency, base, right[:, None], columns)
 
 
 def _with_bumps(
@@ -291,7 +291,7 @@ def _renewed(
     size = 2 * len(local.nodes)
     units = np.eye(len(matrix))[:, -size:]
     factor = cho_factor(matrix, lower=True)
-    solved = cho_solve(factor, np.column_stack([equations.right, units]))[-size:]
+    solved = cho_solve(factor, np.concatenate([equations.right, units], axis=1))[-size:]
     mean, heights = solved[:, 0], np.diagonal(solved[:, 1:])
     return local.renewed(mean.reshape(2, -1), heights.reshape(2, -1))
 
@@ -323,9 +323,8 @@ def with_shown_places(
 
     if largest_gain(functions, estimates(prior)) < SUSPECTED_GAIN:
         return prior
-    columns = np.concatenate([axis * len(matrix) + np.arange(t, len(matrix)) for axis in (0, 1)])
-    joint_matrix = np.asfortranarray(block_diag(matrix, matrix))
-    equations = SignalEquations(functions.frequency, joint_matrix, right.T.ravel(), columns)
+    columns = np.arange(t, len(matrix))
+    equations = SignalEquations(functions.frequency, matrix, right, columns)
     side = max(functions.image_size)
     for _ in range(SWEEPS):
         prior = replace(prior, signal=most_likely_signal(prior.signal, equations, side))

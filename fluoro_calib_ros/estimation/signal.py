@@ -198,18 +198,29 @@ def _slopes(signal: Signal, frequency: NDArray[np.float64]) -> NDArray[np.float6
 
 @dataclass(frozen=True)
 class SignalEquations:
-    """Normal equations of all coefficients of a series, with all priors except the signal's."""
+    """Normal equations of all coefficients of a series, with all priors except the signal's.
+
+    They have d = 1 right side and the c = 2 s coefficients of u and v, or d = 2 right sides, of u
+    and of v, and the c = s coefficients of either, if u and v have the same matrix.
+    """
 
     frequency: NDArray[np.float64]  #: (s,) frequencies of the sines [1/px]
-    #: (p, p) and (p,)
-    information: NDArray[np.float64]
-    right: NDArray[np.float64]
-    columns: NDArray[np.int64]  #: (2 s,) indices of the coefficients of the sines, u first
+    information: NDArray[np.float64]  #: (p, p)
+    right: NDArray[np.float64]  #: (p, d)
+    columns: NDArray[np.int64]  #: (c,) indices of the coefficients of the sines, u first
 
     @property
     def extent(self) -> float:
         """Size of the rectangle of the sines [px]."""
         return float(np.pi / self.frequency.min())
+
+    def of_columns(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values (s, ...) of the sines for all of their coefficients (c, ...)."""
+        return np.concatenate([values] * (len(self.columns) // len(self.frequency)))
+
+    def of_sines(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return sums (s,) over u and v of values (c, d) of the coefficients."""
+        return values.sum(axis=1).reshape(-1, len(self.frequency)).sum(axis=0)
 
 
 @dataclass(frozen=True)
@@ -315,7 +326,7 @@ def _node(
 
 def _cost(signal: Signal, coefficients: SignalEquations) -> float:
     """Return the cost of the likelihood of a signal; infinite if there is no likelihood."""
-    variance = np.tile(signal.variance(coefficients.frequency), 2)
+    variance = coefficients.of_columns(signal.variance(coefficients.frequency))
     factorised = _factorised(variance, coefficients)
     if factorised is None:
         return np.inf
@@ -341,16 +352,15 @@ def _with_likely_ripples(
     frequency = coefficients.frequency
     band = ripples.band(frequency)
     for _ in range(RIPPLE_STEPS):
-        variance = np.tile(signal.variance(frequency), 2)
-        posterior = _posterior(variance, coefficients)
+        variance = signal.variance(frequency)
+        posterior = _posterior(coefficients.of_columns(variance), coefficients)
         if posterior is None:
             return signal
-        mean, square = (
-            np.sum(a.reshape(2, -1), axis=0) for a in (posterior.mean**2, posterior.variance)
-        )
-        determined = np.clip(2 - square / variance[: len(frequency)], MIN_DETERMINED, 2)
+        squares = coefficients.of_sines(posterior.mean**2)
+        left = coefficients.of_sines(np.broadcast_to(posterior.variance, posterior.mean.shape))
+        determined = np.clip(2 - left / variance, MIN_DETERMINED, 2)
         count = len(ripples.variances)
-        sums = [np.bincount(band, a, count)[:count] for a in (mean, determined)]
+        sums = [np.bincount(band, a, count)[:count] for a in (squares, determined)]
         fields = signal.density(np.arange(count) * ripples.width)
         values = np.maximum(
             sums[0] / np.maximum(sums[1], MIN_DETERMINED) - fields, ABSENT_VARIANCE
@@ -380,20 +390,19 @@ def _ranges(side: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 class _Posterior:
     """Posterior of the coefficients of the sines.
 
-    cost: negative logarithm of the marginal likelihood, without constants; mean and variance
-    (2 s,): of the coefficients.
+    cost: negative logarithm of the marginal likelihood, without constants.
     """
 
     cost: float
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    mean: NDArray[np.float64]  #: (c, d)
+    variance: NDArray[np.float64]  #: (c, 1)
 
 
 @dataclass(frozen=True)
 class _Factorised:
     """Normal equations with a prior.
 
-    cost: as in `_Posterior`; factor (p, p): lower triangular; z (p,): solution with factor alone.
+    cost: as in `_Posterior`; factor (p, p): lower triangular; z (p, d): solution with it alone.
     """
 
     cost: float
@@ -404,7 +413,7 @@ class _Factorised:
 def _factorised(
     variance: NDArray[np.float64], coefficients: SignalEquations
 ) -> _Factorised | None:
-    """Return the equations for prior variances (2 s,), or None if they have no solution."""
+    """Return the equations for prior variances (c,), or None if they have no solution."""
     columns = coefficients.columns
     matrix = coefficients.information.copy(order='F')
     matrix[columns, columns] += 1 / variance
@@ -412,14 +421,15 @@ def _factorised(
     if info:
         return None
     z = solve_triangular(factor, coefficients.right, lower=True, check_finite=False)
-    cost = np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(variance)) / 2 - z @ z / 2
+    log_det = np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(variance)) / 2
+    cost = z.shape[1] * log_det - np.sum(z**2) / 2
     return _Factorised(float(cost), factor, z) if np.isfinite(cost) else None
 
 
 def _posterior(
     variance: NDArray[np.float64], coefficients: SignalEquations, limit: float = np.inf
 ) -> _Posterior | None:
-    """Return the posterior for prior variances (2 s,).
+    """Return the posterior for prior variances (c,).
 
     None if there is no posterior, or its cost exceeds the limit.
     """
@@ -435,7 +445,7 @@ def _posterior(
         return None
     # Columns are contiguous, and zero above the diagonal.
     squares = np.sum(np.square(inverse, out=inverse), axis=0)
-    return _Posterior(factorised.cost, mean[columns], squares[columns])
+    return _Posterior(factorised.cost, mean[columns], squares[columns, None])
 
 
 def _likelihood(
@@ -450,18 +460,21 @@ def _likelihood(
     """
     signal = _signal(at, ripples)
     frequency = coefficients.frequency
-    variance = np.tile(signal.variance(frequency), 2)
+    variance = signal.variance(frequency)
+    of_columns = coefficients.of_columns(variance)
     posterior = _posterior(
-        variance, coefficients, limit - _cost_of_priors(at, coefficients.extent)
+        of_columns, coefficients, limit - _cost_of_priors(at, coefficients.extent)
     )
     if posterior is None:
         return None
-    slopes = np.tile(_slopes(signal, frequency), (2, 1))
-    determined = np.clip(1 - posterior.variance / variance, 0, 1)
+    slopes = _slopes(signal, frequency)
+    squares = coefficients.of_sines(posterior.mean**2 + posterior.variance)
+    determined = np.clip(1 - posterior.variance / of_columns[:, None], 0, 1)
+    determined = np.broadcast_to(determined**2, posterior.mean.shape)
     likelihood = _Likelihood(
         posterior.cost,
-        slopes.T @ (1 - (posterior.mean**2 + posterior.variance) / variance) / 2,
-        (slopes * (determined**2)[:, None]).T @ slopes / 2,
+        slopes.T @ (2 - squares / variance) / 2,
+        (slopes * coefficients.of_sines(determined)[:, None]).T @ slopes / 2,
     )
     return _with_priors(likelihood, at, coefficients.extent)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rigs
+from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 from scipy.special import gamma, kv
 from threadpoolctl import threadpool_limits
@@ -366,12 +367,37 @@ def test_slopes_of_the_likelihood_of_a_signal():
     m = len(functions)
     columns = np.concatenate([np.arange(t, m), m + np.arange(t, m)])
 
+    equations = SignalEquations(functions.frequency, information, right[:, None], columns)
+
     def cost(at):
-        return _likelihood(at, SignalEquations(functions.frequency, information, right, columns))
+        return _likelihood(at, equations)
 
     at = np.log([0.6, 300.0, 0.3, 80.0, 3.5])
     numeric = [(cost(at + h).cost - cost(at - h).cost) / 2e-4 for h in 1e-4 * np.eye(5)]
     np.testing.assert_allclose(cost(at).slopes, numeric, rtol=1e-4, atol=1e-4)
+
+
+def test_likelihood_of_u_and_v_with_the_same_matrix():
+    """It is that of both together, and needs only the matrix of one."""
+    functions = Functions((1024, 1024), 3, 12)
+    values = functions(pixels(600, 5, (1024, 1024))) / 0.25
+    matrix = values.T @ values + 1e-3 * np.eye(len(functions))
+    right = values.T @ np.random.default_rng(1).normal(0, 4, (600, 2))
+    t = len(functions.powers)
+    m = len(functions)
+    columns = np.arange(t, m)
+    of_either = SignalEquations(functions.frequency, matrix, right, columns)
+    of_both = SignalEquations(
+        functions.frequency,
+        block_diag(matrix, matrix),
+        right.T.reshape(-1, 1),
+        np.concatenate([columns, m + columns]),
+    )
+    at = np.log([0.6, 300.0, 0.3, 80.0, 3.5])
+    first, second = (_likelihood(at, equations) for equations in (of_either, of_both))
+    assert first.cost == pytest.approx(second.cost, rel=1e-12)
+    np.testing.assert_allclose(first.slopes, second.slopes, rtol=1e-9)
+    np.testing.assert_allclose(first.curvature, second.curvature, rtol=1e-9)
 
 
 @pytest.mark.parametrize('smoothness', [1.5, 4.0])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from .background import TERMS
+from .fine_grid import Absorbers, FineGrid
 from .light import Noise
 from .marker_intensity import LightWindows, Shadows
 from .marker_motion import SHADOW_SD_PX, MarkerStates, MeasuredMarkers, Motion, assign
@@ -29,7 +30,6 @@ from .shadow_fit import (
     MAX_SIGMA_PX,
     MIN_PASSED,
     Beads,
-    FineGrid,
     FitSettings,
     NormalEquations,
     ShadowFit,
@@ -120,16 +120,14 @@ class _MarkerFit(ShadowFit):
         distance = cdist(self.uv, self.uv)
         np.fill_diagonal(distance, np.inf)
         self.distance = distance.min(axis=1, initial=np.inf)
-        self.close = distance < together
-        self.crowded = np.flatnonzero(self.close.any(axis=1))
         near = np.argsort(distance, axis=1, kind='stable')[:, : self.settings.neighbours]
-        return np.where(np.take_along_axis(self.close, near, axis=1), near, -1)
+        return np.where(np.take_along_axis(distance, near, axis=1) < together, near, -1)
 
     def run(self) -> None:
         """Take Gauss-Newton steps; the last step also yields standard deviations."""
         moved = np.zeros(len(self.uv))
         for step in range(self.settings.steps):
-            if step in self.settings.crossing_steps and len(self.crowded):
+            if step in self.settings.crossing_steps:
                 self._cross()
             for rows, near in self.groups:
                 alone = not near.shape[1]
@@ -241,26 +239,33 @@ class _MarkerFit(ShadowFit):
         """Compute how shadows that touch differ from the product of both shadows."""
         reach = 2 * (self.profile.radius_px + self.profile.blur_px)
         reach += float(np.abs(self.way).max(initial=0.0)) * 2
-        rows = self.crowded[self.distance[self.crowded] < reach]
-        if not len(rows):
+        touching = self.distance < reach
+        if not touching.any():
             return
-        self.crossing = np.zeros((len(self.uv), len(self.offset)))
-        grid = FineGrid(self.offset, self.profile)
-        axis = grid.axis
-        for row in rows:
-            neighbours = np.flatnonzero(self.close[row])[: self.settings.neighbours]
-            members = np.concatenate([[row], neighbours])
-            joint = np.zeros((len(axis), len(axis)))
-            for weight, way in zip(self.way_weight, self.way):
-                passed = np.ones_like(joint)
-                for member in members:
-                    u, v = self.uv[member] + way[member] - self.middle[row]
-                    squared = (axis[:, None] - v) ** 2 + (axis - u) ** 2
-                    passed *= 1 - self.depth[member] * self.profile.absorbed(squared)
-                joint += weight * passed
-            shadow, _, _ = self._shadow(members[None], self.middle[row][None])
-            separate = np.prod(1 - self.depth[members][:, None] * shadow[0], axis=0)
-            self.crossing[row] = grid.blurred(joint) - separate
+        self.crossing = np.zeros((len(self.uv), len(self.offset)), dtype=DTYPE)
+        for rows, near in self.groups:
+            chosen = rows[touching[rows]]
+            if len(chosen):
+                members = np.concatenate([chosen[:, None], near[touching[rows]]], axis=1)
+                self.crossing[chosen] = self._crossing_of(chosen, members)
+
+    def _crossing_of(
+        self, rows: NDArray[np.int64], members: NDArray[np.int64]
+    ) -> NDArray[np.floating]:
+        """Return differences (g, m) in windows of markers (g,) with members (g, k)."""
+        there = members >= 0
+        marker = np.where(there, members, 0)
+        depth = self.depth[marker] * there
+        beads = Absorbers(
+            self.way[:, marker] + (self.uv[marker] - self.middle[rows, None]),
+            self.way_weight,
+            depth=depth,
+            extent_px=np.full(marker.shape, self.profile.radius_px),
+            absorbed=lambda _, x, y: self.profile.absorbed(x * x + y * y),
+        )
+        shadow, _, _ = self._shadow(marker, self.middle[rows])
+        separate = np.prod(1 - depth[..., None] * shadow, axis=1)
+        return FineGrid(self.offset, self.profile).light_behind(beads) - separate
 
     def result(self) -> Beads:
         """Return the measured markers."""

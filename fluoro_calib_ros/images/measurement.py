@@ -16,18 +16,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .background import PLANE_TERMS, TERMS
+from .fine_grid import Absorbers, FineGrid
 from .light import Light, Noise, less_common
 from .profile import Absorbed, Profile, Shadows
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
-    FINE,
     MARGIN_PX,
     MIN_INSIDE,
     MIN_PASSED,
     UNDISTURBED,
     Beads,
-    FineGrid,
     FitSettings,
     NormalEquations,
     ShadowFit,
@@ -214,8 +213,8 @@ class BeadFit(ShadowFit):
         return np.asarray(((near >= 0) & (apart < reach)).any(axis=1))
 
     def _squared(
-        self, beads: NDArray[np.int64], x: NDArray[np.float64], y: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+        self, beads: NDArray[np.int64], x: NDArray[np.floating], y: NDArray[np.floating]
+    ) -> NDArray[np.floating]:
         """Return squared distances of pixels (g, ...) from beads (g,) in their metrics [px^2]."""
         metric = self.metric[beads].reshape(-1, 4, *[1] * (np.ndim(x) - 1))
         return metric[:, 0] * x * x + 2 * metric[:, 1] * x * y + metric[:, 3] * y * y
@@ -373,38 +372,31 @@ def _crossing(
     fit: BeadFit, rows: NDArray[np.int64], members: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Return differences (g, m) in windows of beads (g,) with members (g, k), -1 for none."""
-    grid = FineGrid(fit.offset, fit.profile)
-    axis = grid.axis
-    raw = np.ones((len(rows), len(axis), len(axis)), dtype=DTYPE)
+    there = members >= 0
+    bead = np.where(there, members, 0)
+    centre = fit.uv[bead] - fit.middle[rows, None]
+    depth = fit.depth[bead] * there
+
+    def absorbed(
+        column: int, x: NDArray[np.float32], y: NDArray[np.float32]
+    ) -> NDArray[np.floating]:
+        size = fit.size[bead[:, column], None, None]
+        squared = fit._squared(bead[:, column], x, y) / size**2
+        return fit.profile.absorbed(squared.astype(DTYPE), size.astype(DTYPE))
+
+    beads = Absorbers(centre[None], np.ones(1), depth, _extent_px(fit, bead), absorbed)
     blurred = np.ones((len(rows), len(fit.offset)))
-    window = np.arange(len(rows))[:, None, None]
-    for column in members.T:
-        there = column >= 0
-        bead = np.where(there, column, 0)
-        centre = fit.uv[bead] - fit.middle[rows]
-        depth = fit.depth[bead] * there
-        # The points of a square that contains the bead.
-        count = min(int(2 * FINE * _extent_px(fit, bead).max()) + 3, len(axis))
-        first = np.rint((centre - axis[0]) * FINE).astype(int) - count // 2
-        place = np.clip(first, 0, len(axis) - count)[..., None] + np.arange(count)
-        x, y = np.moveaxis(axis[place] - centre[..., None], 1, 0).astype(DTYPE)
-        size = fit.size[bead, None, None]
-        squared = fit._squared(bead, x[:, None], y[:, :, None]) / size**2
-        absorbed = fit.profile.absorbed(squared.astype(DTYPE), size.astype(DTYPE))
-        points = window, place[:, 1, :, None], place[:, 0, None]
-        raw[points] *= 1 - depth[:, None, None] * absorbed
-        x, y = np.moveaxis(fit.offset - centre[:, None], 2, 0)
-        away = np.sqrt(fit._squared(bead, x, y))
-        blurred *= 1 - depth[:, None] * fit.shadows.shadow(away, fit.kind[bead])[0]
-    out = np.empty_like(blurred)
-    for number, image in enumerate(raw):
-        out[number] = grid.blurred(image)
-    return out - blurred
+    for column in range(bead.shape[1]):
+        one = bead[:, column]
+        x, y = np.moveaxis(fit.offset - centre[:, column, None], 2, 0)
+        away = np.sqrt(fit._squared(one, x, y))
+        blurred *= 1 - depth[:, column, None] * fit.shadows.shadow(away, fit.kind[one])[0]
+    return FineGrid(fit.offset, fit.profile).light_behind(beads) - blurred
 
 
 def _extent_px(fit: BeadFit, beads: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return distances (g,) from the centres beyond which beads absorb no light [px]."""
-    widest = np.linalg.inv(fit.metric[beads])[:, [0, 1], [0, 1]].max(axis=1)
+    """Return distances (...) from the centres beyond which beads (...) absorb no light [px]."""
+    widest = np.linalg.inv(fit.metric[beads])[..., [0, 1], [0, 1]].max(axis=-1)
     return np.asarray(fit.profile.radius_px * fit.size[beads] * np.sqrt(widest))
 
 

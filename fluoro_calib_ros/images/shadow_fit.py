@@ -39,7 +39,6 @@ MIN_INSIDE = 0.6  # least share of a window inside the field
 # not if it changes in the beam. The share is between a half and one.
 DRAWN = 0.75
 DRAWN_SD = 0.5 / np.sqrt(12)
-FINE = 3  # points per pixel of the grid on which shadows that touch are blurred
 OVERLAP = 0.85  # fraction of the sum of both reaches; shadows that are nearer overlap
 DISTURBED = 1.6  # relative lack of fit from which pixels with large residuals are down-weighted
 AT_ONCE = 2**18  # derivatives computed together, 1 MB: they fit into a cache
@@ -96,28 +95,6 @@ class NormalEquations:
     #: (g, m), residuals of the pixels over their standard deviations; 0 for invalid pixels
     residual: NDArray[np.floating]
     valid: NDArray[np.bool_]  #: (g, m)
-
-
-class FineGrid:
-    """Grid finer than the pixels, on which light that passes through several beads is blurred.
-
-    The blurred light behind two beads is not the product of their blurred shadows. axis: (a,)
-    coordinates of the points, relative to the middle of a window [px].
-    """
-
-    def __init__(self, offset: NDArray[np.int64], profile: Profile) -> None:
-        self._blurs = profile.blurs
-        half = int(np.abs(offset).max()) + int(np.ceil(3 * self._blurs[-1][1]))
-        self.axis = np.arange(-half * FINE, half * FINE + 1) / FINE
-        self._column, self._row = (offset.T + half) * FINE
-
-    def blurred(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return blurred light (a, a) at the pixels (m,) of a window."""
-        smooth = [
-            weight * cv2.GaussianBlur(light, (0, 0), FINE * sigma, borderType=cv2.BORDER_REPLICATE)
-            for weight, sigma in self._blurs
-        ]
-        return np.asarray(sum(smooth))[self._row, self._column]
 
 
 def _parts(rows: NDArray[np.int64], near: NDArray[np.int64], pixels: int) -> list[Group]:

@@ -19,6 +19,7 @@ from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import following, marker_ids, matching
+from fluoro_calib_ros.images.fine_grid import Absorbers, FineGrid
 from fluoro_calib_ros.images.lattice import GridPose
 from fluoro_calib_ros.images.light import LAGS, Light, Noise
 from fluoro_calib_ros.images.marker_fit import MarkerGuess, fit_markers
@@ -32,7 +33,6 @@ from fluoro_calib_ros.images.matching import PhantomModel
 from fluoro_calib_ros.images.measurement import circles, measure_beads
 from fluoro_calib_ros.images.pose_search import _hits, triples_of
 from fluoro_calib_ros.images.profile import Profile
-from fluoro_calib_ros.images.shadow_fit import FineGrid
 from fluoro_calib_ros.images.texture import window_offsets
 from fluoro_calib_ros.images.view import Lens, View
 
@@ -104,20 +104,28 @@ def test_markers_that_touch_are_where_they_are_without_noise(apart, motion):
 
 
 @pytest.mark.parametrize('blur', [0.5, 2.0])
-def test_a_fine_grid_reaches_beyond_its_window_by_the_blur(blur):
-    grid = FineGrid(window_offsets(6.0), Profile(3.0, blur, 1.0))
-    assert (
-        grid.axis[-1] == 6 + np.ceil(3 * np.hypot(blur, 12**-0.5))
-        and grid.axis[0] == -grid.axis[-1]
+@pytest.mark.parametrize('place', [(1.3, -0.4), (6.0, 3.0)])
+def test_light_is_blurred_behind_two_beads_that_move(blur, place):
+    """Two Gaussian shadows at one place, inside the window or at its border, move by 2 px."""
+    offset = window_offsets(6.0)
+    path = np.array([[0.0, 0.0], [2.0, 0.0]])
+    beads = Absorbers(
+        np.broadcast_to(place + path[:, None, None], (2, 1, 2, 2)),
+        np.array([0.3, 0.7]),
+        depth=np.full((1, 2), 0.5),
+        extent_px=np.full((1, 2), 5.0),
+        absorbed=lambda _, x, y: np.exp(-0.5 * (x * x + y * y)),
     )
-    assert np.diff(grid.axis) == pytest.approx(1 / 3)
-    plane = 100.0 + 3 * grid.axis[:, None] - 2 * grid.axis
-    u, v = window_offsets(6.0).T
-    np.testing.assert_allclose(grid.blurred(plane), 100 + 3 * v - 2 * u, atol=0.01)
-    spot = np.exp(-0.5 * (grid.axis[:, None] ** 2 + grid.axis**2))
-    variance = 1 + blur**2 + 1 / 12
-    expected = np.exp(-0.5 * (u * u + v * v) / variance) / variance
-    np.testing.assert_allclose(grid.blurred(spot), expected, atol=0.02)
+    (light,) = FineGrid(offset, Profile(3.0, blur, 1.0)).light_behind(beads)
+
+    def blurred(variance, shift):
+        wider = variance + blur**2 + 1 / 12
+        squared = np.sum((offset - place - shift) ** 2, axis=1)
+        return variance / wider * np.exp(-0.5 * squared / wider)
+
+    # (1 - s / 2)^2 = 1 - s + s^2 / 4, and s^2 is a Gaussian of half the variance.
+    first, second = (1 - blurred(1.0, shift) + blurred(0.5, shift) / 4 for shift in path)
+    np.testing.assert_allclose(light, 0.3 * first + 0.7 * second, atol=0.02)
 
 
 # ---- responses

@@ -42,6 +42,9 @@ FIRST_RESIDUAL_PX = 2.5
 ALONE_RADII = 2.5  # least distance of an isolated bead from the next shadow [radii]
 MIN_ACCEPTED = 0.5  # least share of the matched beads that are measured well
 MIN_SCATTER_PX = 0.05
+# Share of the shifts of shadows by distortion within them that remains after the correction: 0.46,
+# 0.57 and 0.63 with shadows of 17 px (`benchmarks.calibrated_renderings`, large beads).
+BENT_LEFT = 0.55
 # Reasons why predicted beads are not observed, without a number.
 LOST = Finding(Kind.BEAD_LOST, 'cut off, or lost while it was measured')
 DISTURBED = Finding(Kind.BEAD_DISTURBED, 'another object is next to it')
@@ -238,8 +241,13 @@ def _measured(
     xyz = model.xyz[extraction.bead]
     shift = view.shadow_shift(xyz, of_bead)
     bent = shift - view.with_degree(1).shadow_shift(xyz, of_bead)
-    bent_px = float(np.sqrt(np.mean(np.sum(bent**2, axis=1)) / 2))
-    return replace(extraction, uv=extraction.uv - shift, bent_px=bent_px)
+    bent_px = np.sqrt(np.sum(bent**2, axis=1) / 2)
+    return replace(
+        extraction,
+        uv=extraction.uv - shift,
+        sigma=np.hypot(extraction.sigma, BENT_LEFT * bent_px),
+        bent_px=float(np.sqrt(np.mean(bent_px**2))),
+    )
 
 
 @dataclass(frozen=True)

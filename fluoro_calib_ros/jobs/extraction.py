@@ -18,6 +18,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
+from ..images.extraction import BENT_LEFT
 from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.overlay import small_jpeg
 from ..images.view import Lens, assumed_lens, lacks_certain_pose, shared_lens
@@ -203,9 +204,6 @@ def run_extraction(
     return ExtractionOutcome(request.fluoroscope, tuple(results), notes)
 
 
-# Share of the shifts of shadows that remains after the polynomials of the exposures: 0.46, 0.57
-# and 0.63 with shadows of 17 px (`benchmarks.calibrated_renderings`, large beads).
-BENT_LEFT = 0.55
 # Independent errors of a correction per coordinate: the median of `benchmarks.pathologies`.
 FREE_ERRORS = 42
 
@@ -213,7 +211,7 @@ FREE_ERRORS = 42
 def bent_shadows(fluoroscope: str, results: Sequence[ImageResult]) -> Finding | None:
     """Return a warning if distortion within shadows shifts a correction beyond its noise.
 
-    The exposures share that shift, and no standard deviation includes it.
+    The exposures share that shift, so the standard deviation of a correction does not include it.
     """
     used = [result for result in results if result.frame is not None]
     sigma = np.concatenate([result.sigma for result in used])

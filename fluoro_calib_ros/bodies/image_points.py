@@ -34,6 +34,7 @@ class Linear:
     by_place: NDArray[np.float64]
     uv: NDArray[np.float64]  # predicted
     by_pose: NDArray[np.float64]  # (B, M, 3, 6), derivatives D of places with respect to the pose
+    valid: NDArray[np.bool_]  # (B, M, F), whether seen, and the marker in front of the source
 
 
 class Cameras:
@@ -117,7 +118,7 @@ class Cameras:
         valid = points.seen & np.isfinite(depth)
         residual = np.where(valid[..., None], points.uv - uv, 0.0)
         by_place = np.where(valid[..., None, None], by_place, 0.0)
-        return Linear(residual, by_place, uv, by_pose(arm))
+        return Linear(residual, by_place, uv, by_pose(arm), valid)
 
     def by_orientation(self, linear: Linear) -> NDArray[np.float64]:
         """Return derivatives (B, M, F, 2, 9) by T, w, xp, yp, c; see collinearity."""

@@ -21,7 +21,7 @@ from scipy.linalg import eigh
 
 from ..correction.series import Functions
 from ..photogrammetry.rig_orientation import RigOrientation
-from .diagnosis import OF_RIG, Cause, Change, Diagnosis, Diagnostician
+from .diagnosis import FITS, OF_RIG, Cause, Change, Diagnosis, Diagnostician
 from .rig_adjustment import RigAdjustment
 from .rig_errors import drift_errors
 
@@ -177,7 +177,7 @@ def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tup
     for f in range(len(adjustment.functions)):
         prior = prior.widened(diagnostician.sd_of(Change(Cause.DISTORTION, f)))
     covariance = adjustment.covariance_at(diagnosis.observed, prior, diagnosis.solution)
-    places = adjustment.places_at(diagnosis.solution)
+    places = adjustment.places_at(diagnosis.solution, FITS)
     errors, by_noise = drift_errors(adjustment, covariance, places)
     variance = diagnosis.observed.variance[diagnosis.observed.seen].mean()
     return float(np.sqrt(3) * errors.place_mm), by_noise * float(np.sqrt(variance))

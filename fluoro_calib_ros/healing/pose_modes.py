@@ -120,12 +120,8 @@ def _loss(
     prior: Prior,
     estimate: tuple[NDArray[np.float64], Poses],
 ) -> NDArray[np.float64]:
-    """Return minus twice the log likelihood (T, B) of poses.
-
-    Image points of markers behind a source count as false.
-    """
+    """Return minus twice the log likelihood (T, B) of poses."""
     terms = Mixture.of(
         adjustment, LinearPoints.of(adjustment, observed, *estimate), observed, prior
     )
-    losses = np.where(terms.good, terms.losses, -2 * np.log(terms.false))
-    return np.asarray(np.where(observed.seen, losses, 0.0).sum(axis=(2, 3)))
+    return np.asarray(terms.losses.sum(axis=(2, 3)))

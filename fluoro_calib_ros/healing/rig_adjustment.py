@@ -332,11 +332,15 @@ class RigAdjustment:
         whitened = np.eye(root.shape[1]) + root.T @ normal @ root
         return np.asarray(root @ np.linalg.solve(whitened, root.T))
 
-    def places_at(self, solution: RigSolution) -> NDArray[np.float64]:
-        """Return places (n, 3) [mm] of all markers in the exposures that show their bodies."""
+    def places_at(self, solution: RigSolution, min_inliers: float) -> NDArray[np.float64]:
+        """Return places (n, 3) [mm] of all markers in the exposures that show their bodies.
+
+        Poses with a smaller share of inliers do not count.
+        """
         poses = solution.poses
         xyz = self.shapes_at(solution.values) @ np.swapaxes(poses.rotation, 2, 3)
-        known = poses.known[..., None] & (self.target_id >= 0)
+        fits = poses.known & (solution.inliers_of_pose >= min_inliers)
+        known = fits[..., None] & (self.target_id >= 0)
         return np.asarray((xyz + poses.centre_mm[:, :, None])[known])
 
     # -- the solution
@@ -560,7 +564,8 @@ class LinearPoints:
     by_orientation: NDArray[np.float64]  # (..., 2, 9)
     functions: NDArray[np.float64]  # (..., n), functions of a drift
     place_by_pose: NDArray[np.float64]  # (T, B, M, 3, 6)
-    good: NDArray[np.bool_]
+    seen: NDArray[np.bool_]  # by poses that are known
+    good: NDArray[np.bool_]  # seen, and the marker in front of the source
     shape: NDArray[np.float64]  # (B, M, 3)
     poses: Poses
 
@@ -590,7 +595,6 @@ class LinearPoints:
         by_orientation = cameras.by_orientation(linear)
         rotation_change = values[adjustment.rig].reshape(-1, ORIENTATION_SIZE)[:, 3:6]
         by_orientation[..., 3:6] = by_orientation[..., 3:6] @ _by_vector(rotation_change)
-        predicted = linear.uv.reshape(*grid, 2)
         residual = linear.residual.reshape(*grid, 2)
         coefficients = adjustment.drift_at(values)
         # Evaluate the drift at the image point predicted by the model. At the observed pixel,
@@ -607,7 +611,8 @@ class LinearPoints:
             by_orientation.reshape(*grid, 2, ORIENTATION_SIZE),
             functions,
             place_by_pose=linear.by_pose.reshape(*grid[:3], 3, POSE_SIZE),
-            good=valid & np.isfinite(predicted).all(axis=-1),
+            seen=valid,
+            good=linear.valid.reshape(grid),
             shape=shape,
             poses=poses,
         )
@@ -626,12 +631,16 @@ def _drift(
 
 @dataclass(frozen=True)
 class Mixture:
-    """Squared standardised residuals (T, B, M, F), and the density of false matches there."""
+    """Squared standardised residuals (T, B, M, F), and the density of false matches there.
+
+    Image points of markers behind a source are seen, but not good: they are false matches.
+    """
 
     squares: NDArray[np.float64]
     variance: NDArray[np.float64]
     inflation: NDArray[np.float64]
     false: NDArray[np.float64]  # density relative to that of a residual of 0
+    seen: NDArray[np.bool_]
     good: NDArray[np.bool_]
 
     @classmethod
@@ -647,9 +656,8 @@ class Mixture:
         variance = observed.variance * inflation
         squares = np.sum(linear.residual**2, axis=-1) / variance
         false = FALSE_SHARE / (1 - FALSE_SHARE) * 2 * np.pi * observed.variance / adjustment._area
-        return cls(
-            squares, variance, np.broadcast_to(inflation, squares.shape), false, linear.good
-        )
+        inflation = np.broadcast_to(inflation, squares.shape)
+        return cls(squares, variance, inflation, false, seen=linear.seen, good=linear.good)
 
     @property
     def scale(self) -> NDArray[np.float64]:
@@ -676,8 +684,8 @@ class Mixture:
     @property
     def losses(self) -> NDArray[np.float64]:
         """Minus twice the log likelihoods."""
-        density = np.exp(-0.5 * self.squares) / self.inflation + self.false
-        return np.where(self.good, -2 * np.log(density), 0.0)
+        density = np.where(self.good, np.exp(-0.5 * self.squares) / self.inflation, 0.0)
+        return np.where(self.seen, -2 * np.log(density + self.false), 0.0)
 
     def shares(self) -> dict[str, NDArray[np.float64]]:
         """Return losses, squares and their expectation by marker, and shares of inliers."""
@@ -687,8 +695,8 @@ class Mixture:
         share = np.where(count > 2 * POSE_SIZE, 1 - POSE_SIZE / np.maximum(count, 1), 0.0)
         weighted = inlier * (share > 0)[..., None, None]
         with np.errstate(invalid='ignore', divide='ignore'):
-            marker_share = inlier.sum(axis=(0, 3)) / self.good.sum(axis=(0, 3))
-            pose_share = inlier.sum(axis=(2, 3)) / self.good.sum(axis=(2, 3))
+            marker_share = inlier.sum(axis=(0, 3)) / self.seen.sum(axis=(0, 3))
+            pose_share = inlier.sum(axis=(2, 3)) / self.seen.sum(axis=(2, 3))
         return {
             'losses': self.losses.sum(axis=(0, 3)),
             'squares': (weighted * self.squares * self.inflation).sum(axis=(0, 3)),

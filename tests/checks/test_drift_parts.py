@@ -3,6 +3,7 @@
 
 """Parts of the drift watch against explicit matrices and sums."""
 
+from dataclasses import replace
 from types import SimpleNamespace as Fake
 
 import numpy as np
@@ -164,7 +165,8 @@ def body_scene(n=3, markers=5, views=3, seed=7):
         rng.uniform(0.01, 0.05, shape),
         seen,
     )
-    return Linear(residual, by_place, points.uv, by_pose), points, rng.uniform(0, 0.1, shape[:2])
+    linear = Linear(residual, by_place, points.uv, by_pose, seen)
+    return linear, points, rng.uniform(0, 0.1, shape[:2])
 
 
 def test_what_a_body_tells_of_a_shift_is_that_of_least_squares_with_its_pose():
@@ -233,15 +235,11 @@ def test_displacements_of_a_body_are_clipped_from_its_robust_pose():
     shift = (linear.by_pose @ turn[:, None, :, None])[..., 0]
     seen = points.seen[..., None]
     residual = (linear.by_place @ shift[:, :, None, :, None])[..., 0] * seen
-    exact = _Drift.of(
-        Linear(residual, linear.by_place, linear.uv, linear.by_pose), points, variance
-    )
+    exact = _Drift.of(replace(linear, residual=residual), points, variance)
     there = points.seen.any(axis=2)
     np.testing.assert_allclose(watch._clipped(exact)[there], 0, atol=1e-9)
     residual[0, 4] += 300.0 * points.seen[0, 4][:, None]
-    false = _Drift.of(
-        Linear(residual, linear.by_place, linear.uv, linear.by_pose), points, variance
-    )
+    false = _Drift.of(replace(linear, residual=residual), points, variance)
     clipped = watch._clipped(false)
     length = np.sqrt(np.einsum('nmi,nmij,nmj->nm', clipped, false.s_matrix, clipped))
     # 3 deviations of one coordinate are as rare as 3.76 of three, by chi-square.

@@ -126,9 +126,10 @@ def test_inliers_are_told_from_false_matches_that_lie_anywhere():
     variance = np.array([0.04, 0.09, 0.16])[None, None, :, None]
     scale = np.array([[[1.0, 2.0, 1.0]]])
     area = 1e6
+    good = np.ones((1, 1, 3, 1), dtype=bool)
     found = Mixture.of(
         Fake(_area=area),
-        Fake(residual=residual, good=np.ones((1, 1, 3, 1), dtype=bool)),
+        Fake(residual=residual, seen=np.ones((1, 1, 3, 1), dtype=bool), good=good),
         Fake(variance=variance),
         Fake(inflation=scale),
     )
@@ -139,6 +140,10 @@ def test_inliers_are_told_from_false_matches_that_lie_anywhere():
     # The likelihood relative to that of a zero residual without the scale.
     likelihood = (density + 0.01 / area) * 2 * np.pi * variance / 0.99
     np.testing.assert_allclose(found.losses, -2 * np.log(likelihood))
+    # A marker behind the source cannot have made its image point.
+    behind = replace(found, good=np.array([True, True, False]).reshape(good.shape))
+    assert behind.inlier()[0, 0, 2, 0] == 0
+    assert behind.losses[0, 0, 2, 0] == pytest.approx(-2 * np.log(found.false[0, 0, 2, 0]))
 
 
 def test_errors_of_points_are_of_their_scale_of_each_and_of_all_together():
@@ -406,6 +411,26 @@ def test_pose_with_two_false_matches_does_not_take_others_for_false():
     assert found.evidence > astray.evidence + 10
     turn = found.poses.rotation[5, 1] @ scene.rotation[5, 1].T
     assert Rotation.from_matrix(turn).magnitude() < 0.02
+
+
+@pytest.mark.parametrize('seed', [50, 51, 52])
+def test_markers_behind_a_source_are_false_matches(seed):
+    """In one view, two of four image points are false; a pose behind the source explains none."""
+    scene = Scene(seed)
+    adjustment = scene.diagnostician().adjustment
+    observed = scene.observe()
+    uv = observed.uv.copy()
+    uv[5, 1, [0, 3], 0] = [[200.0, 700.0], [800.0, 300.0]]
+    seen = observed.seen.copy()
+    seen[5, 1, :, 1] = False
+    seen[5, 1, 4] = False
+    observed = replace(observed, uv=uv, pixel=uv, seen=seen)
+    prior = adjustment.healthy_prior(observed, 1e-4)
+    start = adjustment.solve(observed, prior, (np.zeros(adjustment.size), scene.poses()))
+    found = with_best_modes(adjustment, observed, prior, start)
+    linear = LinearPoints.of(adjustment, observed, found.values, found.poses)
+    assert linear.good[5, 1, :4, 0].all()
+    assert found.inliers_of_pose[5, 1] == pytest.approx(0.5, abs=0.02)
 
 
 def test_false_matches_are_tried_alone_and_in_pairs_of_bodies_with_few_image_points():

@@ -284,8 +284,7 @@ class PoseSolver:
             if not (remaining * (step * right).sum(axis=1) > LAST_STEP).any():
                 break
         # The derivatives remain valid; only the residuals change by the last step.
-        shift = (linear.by_pose @ step[:, None, :, None])[:, :, None]
-        linear = replace(linear, residual=linear.residual - (linear.by_place @ shift)[..., 0])
+        linear = _after(linear, step)
         s_vector = _vectors(_weighted(linear, weight), linear.residual)
         marker = replace(
             marker,
@@ -340,10 +339,11 @@ class PoseSolver:
         # to reject them: the body may have been hit.
         normal = by_marker.sum(axis=1)
         squares = _own_squares(marker, self.variance)
+        own_step = np.zeros((len(used), 1, POSE_SIZE, 1))
         if not solution.alone.all():
-            pose_step = _solved(_eigen(normal), gradient.sum(axis=1))[:, None, :, None]
-            change = (by_marker @ pose_step)[..., 0]
-            squares = squares + np.sum((change - 2 * gradient) * pose_step[..., 0], axis=-1)
+            own_step = _solved(_eigen(normal), gradient.sum(axis=1))[:, None, :, None]
+            change = (by_marker @ own_step)[..., 0]
+            squares = squares + np.sum((change - 2 * gradient) * own_step[..., 0], axis=-1)
             gradient = gradient - change
         limit = self._limit[2 * points.seen.sum(axis=2) * used]
         suspect = np.flatnonzero((squares.sum(axis=1)[:, None] > limit).any(axis=1))
@@ -353,15 +353,13 @@ class PoseSolver:
         gradient = gradient[suspect]
         normal_of_others = normal[suspect, None] - by_marker[suspect]
         # A marker that the others do not predict is tested by its own rays only.
-        unit, scale = _of_unit_diagonal(normal_of_others)
-        predicted = np.linalg.eigvalsh(unit)[..., 0] > WEAK
-        inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, EYE_6))
-        reduced = gradient / scale
-        gain = np.sum(reduced * (inverse @ reduced[..., None])[..., 0], axis=-1)
-        excess = (squares[suspect] + np.where(predicted, gain, 0.0)) / limit
-        excess = np.where(used[suspect], excess, 0.0)
+        others = _inverse_where_regular(normal_of_others)
+        gain = np.sum(gradient * (others @ gradient[..., None])[..., 0], axis=-1)
+        excess = np.where(used[suspect], (squares[suspect] + gain) / limit, 0.0)
         if (excess > 1).any():
-            excess = excess / _growth_by_rig(self.cameras, solution, points, normal, suspect)
+            own = replace(solution, linear=_after(solution.linear, own_step[:, 0, :, 0]))
+            squares_by_rig = _squares_by_rig(self, own, suspect, normal, others)
+            excess = np.where(used[suspect], excess - squares_by_rig / limit, 0.0)
         test[suspect] = np.where(used[suspect], excess, test[suspect])
         if not (excess > 1).any():
             return suspect[:0], suspect[:0]
@@ -436,29 +434,49 @@ def _excludes(prediction: Prediction, row: int, second: _Solution, limit: float)
     return bool(squares > limit)
 
 
-def _growth_by_rig(
-    cameras: Cameras,
-    solution: _Solution,
-    points: ImagePoints,
-    normal: NDArray[np.float64],
-    rows: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """Return factors (S, M) by which errors of rig orientation increase squares of markers.
+def _after(linear: Linear, step: NDArray[np.float64]) -> Linear:
+    """Return image points with the residuals after steps (B, 6) of the poses."""
+    shift = (linear.by_pose @ step[:, None, :, None])[:, :, None]
+    return replace(linear, residual=linear.residual - (linear.by_place @ shift)[..., 0])
 
-    The part of these errors that the pose absorbs does not count. rows (S,): bodies.
+
+def _squares_by_rig(
+    solver: PoseSolver,
+    solution: _Solution,
+    rows: NDArray[np.int64],
+    normal: NDArray[np.float64],
+    others: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the parts (S, M) of squares of markers that errors of the rig orientation explain.
+
+    The squares of a marker are a quadratic form Q of the residuals r at the best pose. Errors of
+    the orientation, in k directions of unit variance, add B, whose part that the pose absorbs does
+    not count. With both, the squares are Q(r, r) - Q(r, B) (I + Q(B, B))^-1 Q(B, r) (Woodbury).
+
+    rows (S,): bodies. normal (B, 6, 6): normal matrices of the poses. others (S, M, 6, 6): inverse
+    normal matrices of the other markers, 0 if these do not predict the marker.
     """
     linear = solution.linear
     weight = solution.marker.weight[rows]
     by_place = linear.by_place[rows]
-    by_rig = cameras.by_orientation(linear)[rows] @ cameras.root  # (S, M, F, 2, k)
-    pull = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
     d = linear.by_pose[rows]
-    right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pull).sum(axis=1)
+    weighted = np.swapaxes(by_place * weight[..., None, None], 3, 4)
+    by_rig = solver.cameras.by_orientation(linear)[rows] @ solver.cameras.root  # (S, M, F, 2, k)
+    by_marker = np.swapaxes(d, 2, 3) @ solution.marker.m[rows]
+    right = (by_marker @ (weighted @ by_rig).sum(axis=2)).sum(axis=1)
     unit, scale = _of_unit_diagonal(normal[rows])
     pose_change = np.linalg.solve(unit + WEAK * EYE_6, right / scale[..., None]) / scale[..., None]
     absorbed = by_place @ (d @ pose_change[:, None])[:, :, None]
-    squares = np.sum((by_rig - absorbed) ** 2, axis=(3, 4)) * weight
-    return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
+    both = np.concatenate([by_rig - absorbed, linear.residual[rows][..., None]], axis=-1)
+    place = (weighted @ both).sum(axis=2)
+    pose = by_marker @ place
+    both = (both * np.sqrt(weight)[..., None, None]).reshape(*weight.shape[:2], -1, both.shape[-1])
+    shape = solver.variance[rows][..., None, None] * (solution.marker.m[rows] @ place)
+    form = np.swapaxes(both, 2, 3) @ both - np.swapaxes(place, 2, 3) @ shape
+    form = form + np.swapaxes(pose, 2, 3) @ others @ pose
+    mixed = form[..., :-1, -1:]
+    inner = np.eye(form.shape[-1] - 1) + form[..., :-1, :-1]
+    return np.asarray((mixed * np.linalg.solve(inner, mixed)).sum(axis=(2, 3)))
 
 
 def _of_unit_diagonal(
@@ -467,6 +485,14 @@ def _of_unit_diagonal(
     """Scale normal matrices (..., 6, 6) to unit diagonal; also return the scale (..., 6)."""
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 1e-12))
     return normal / (scale[..., :, None] * scale[..., None, :]), scale
+
+
+def _inverse_where_regular(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return inverses (..., 6, 6) of normal matrices, 0 for matrices that are nearly singular."""
+    unit, scale = _of_unit_diagonal(normal)
+    regular = (np.linalg.eigvalsh(unit)[..., 0] > WEAK)[..., None, None]
+    inverse = np.linalg.inv(np.where(regular, unit, EYE_6))
+    return np.where(regular, inverse / (scale[..., :, None] * scale[..., None, :]), 0.0)
 
 
 def _own_squares(marker: _Marker, variance: NDArray[np.float64]) -> NDArray[np.float64]:

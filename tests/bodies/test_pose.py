@@ -8,6 +8,7 @@ import pytest
 from body_views import Noise, body, exposure, observed, orientation, project
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, norm
 
 from fluoro_calib_ros.bodies.body import Body, check_bodies
 from fluoro_calib_ros.bodies.pose import (
@@ -182,6 +183,64 @@ def test_false_marker_is_found_and_the_others_stay():
             error = error_of(found, rotation, centre)
             assert np.linalg.norm(error[:3]) < 0.5
     assert wrong <= 3
+
+
+def differences(function, size, step):
+    """Derivatives (..., size) of a function of a vector, by central differences."""
+    steps = step * np.eye(size)
+    return np.stack([(function(h) - function(-h)) / (2 * step) for h in steps], axis=-1)
+
+
+def test_false_marker_is_found_beside_errors_of_the_rig():
+    """The test is e' (S + B B')^-1 e of its residuals e from the pose of the others (peer: dense).
+
+    S is their covariance without errors of the rig, B their change by those of unit variance.
+    """
+    rng = np.random.default_rng(17)
+    sd = np.tile([0.1] * 3 + [2e-4] * 3 + [0.5, 0.5, 2.0], 2)
+    rig = orientation(covariance=np.diag(sd**2))
+    root = rig.covariance_root()
+    noise = Noise(0.3)
+    shape_sd = 0.03
+    limit = chi2.isf(2 * norm.sf(4), 4)
+    for _ in range(4):
+        given = body(rng, 5, sd=shape_sd)
+        rotation, centre = random_pose(rng)
+        markers = given.xyz_mm - given.centre
+        true = markers @ rotation.T + centre
+        uv = project(rig, true, root @ rng.normal(size=len(root)))
+        uv = uv + rng.normal(0, noise.px, uv.shape)
+        uv[0, 2] += [0.0, 6.0]
+        found = PoseSolver(rig, [given]).solve(
+            exposure(rig, given.target_id, uv, noise, reject=None), UNKNOWN
+        )
+        assert found.used[0].tolist() == [True, True, False, True, True]
+        rotation, centre = found.rotation[0], found.centre_mm[0]
+
+        def of_pose(step):
+            turned = markers @ rotation.T @ Rotation.from_rotvec(step[3:]).as_matrix().T
+            return project(rig, turned + centre + step[:3]).transpose(1, 0, 2).reshape(5, 4)
+
+        points = markers @ rotation.T + centre
+
+        def of_place(step):
+            return project(rig, points + step).transpose(1, 0, 2).reshape(5, 4)
+
+        def of_rig(step):
+            return project(rig, points, root @ step).transpose(1, 0, 2).reshape(5, 4)
+
+        by_pose, by_place = differences(of_pose, 6, 1e-4), differences(of_place, 3, 1e-3)
+        by_rig = differences(of_rig, root.shape[1], 1e-2)
+        covariance = noise.px**2 * np.eye(4) + shape_sd**2 * by_place @ np.swapaxes(by_place, 1, 2)
+        weighted = np.swapaxes(np.linalg.solve(covariance, by_pose), 1, 2)
+        others = np.arange(5) != 2
+        pose_covariance = np.linalg.inv((weighted @ by_pose)[others].sum(axis=0))
+        by_others = -pose_covariance @ (weighted @ by_rig)[others].sum(axis=0)
+        e = uv.transpose(1, 0, 2).reshape(5, 4)[2] - of_pose(np.zeros(6))[2]
+        b = by_rig[2] + by_pose[2] @ by_others
+        total = covariance[2] + by_pose[2] @ pose_covariance @ by_pose[2].T + b @ b.T
+        expected = e @ np.linalg.solve(total, e) / limit
+        assert found.test[0, 2] == pytest.approx(expected, rel=0.02)
 
 
 def test_true_markers_are_kept():

@@ -19,13 +19,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from ..options import option, validate_options
-from .stamps import StampAgreement, StampedFrame
+from .stamps import RESTART_NS, Order, StampAgreement, StampedFrame, order_of
 
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # minimum number of views for an intersection
 PATIENCE = 32  # in frames: a stall of 32 ms at 1000 Hz
-# A stamp earlier than the last one by more than this starts a new stream; else it is out of order.
-RESTART_NS = 1_000_000_000
 UNLIMITED = 10**9  # frames
 
 # Frames by fluoroscope: dataclasses with the fields of PairableFrame.
@@ -159,6 +157,8 @@ class _Counts:
         self.incomplete = 0
         self.silent: frozenset[str] = frozenset()
         self.stamps = StampAgreement(self.fluoroscopes)
+        # Latest frame of each stream.
+        self._latest: dict[str, PairableFrame] = {}
         self._by_number = options.by_number
         self._exposures = 0
         self.use(options)
@@ -169,6 +169,25 @@ class _Counts:
             raise ValueError('pair_by cannot change while frames are being paired')
         self._tolerance = options.tolerance_ns
         self._max_waiting = options.waiting
+
+    def _key(self, frame: PairableFrame) -> int:
+        """Return what the frames of an exposure have in common: number or stamp."""
+        return frame.number if self._by_number else frame.stamp_ns
+
+    def _order(self, frame: PairableFrame) -> Order:
+        """Return the place of a frame in its stream.
+
+        A number that does not increase restarts the stream if time increases, or if the number
+        decreases by more than frames can be out of order.
+        """
+        latest = self._latest.get(frame.fluoroscope)
+        if latest is None or self._key(frame) > self._key(latest):
+            return Order.IN_ORDER
+        order = order_of(frame.stamp_ns, latest.stamp_ns)
+        if not self._by_number:
+            return order
+        is_close = latest.number - frame.number <= self._max_waiting
+        return Order.LATE if order is Order.LATE and is_close else Order.RESTART
 
     def _count_late(self, name: str) -> None:
         self.late[name] += 1
@@ -209,7 +228,7 @@ class CompletePairer(_Counts):
         """Add a frame; return the exposure that it completes, if any."""
         name = frame.fluoroscope
         waiting = self._waiting[name]
-        key = frame.number if self._by_number else frame.stamp_ns
+        key = self._key(frame)
         if self._is_late(name, key):
             self._count_late(name)
             return ()
@@ -296,8 +315,7 @@ class PartialPairer(_Counts):
         self._queues: dict[str, deque[tuple[int, Any]]] = {
             name: deque() for name in self.fluoroscopes
         }
-        # Key and stamp of the last frame.
-        self._last: dict[str, tuple[int, int] | None] = dict.fromkeys(self.fluoroscopes)
+        self._latest.clear()
         # Largest key of the exposures that were released without the fluoroscope.
         self._passed: dict[str, float] = dict.fromkeys(self.fluoroscopes, float('-inf'))
         self._recent.clear()
@@ -314,14 +332,14 @@ class PartialPairer(_Counts):
         """Add a frame; return the exposures that are now ready."""
         name = frame.fluoroscope
         ready: list[Exposure] = []
-        key = frame.number if self._by_number else frame.stamp_ns
-        last = self._last[name]
-        if last is not None and key <= last[0]:
-            if not self._is_restart(key, frame.stamp_ns, *last):
-                self._count_late(name)
-                return ready
+        key = self._key(frame)
+        order = self._order(frame)
+        if order is Order.LATE:
+            self._count_late(name)
+            return ready
+        if order is Order.RESTART:
             ready = self.flush()
-        self._last[name] = key, frame.stamp_ns
+        self._latest[name] = frame
         if key <= self._passed[name]:
             self._count_late(name)
             # Its lag is within the patience, so it is waited for from now on.
@@ -337,17 +355,6 @@ class PartialPairer(_Counts):
             self.unpaired[name] += 1
             ready += self._release()
         return ready
-
-    def _is_restart(self, key: int, stamp_ns: int, last: int, last_ns: int) -> bool:
-        """Return whether a frame that is not later than the last one of its stream restarts it.
-
-        Its number decreases while time increases, or by more than frames can be out of order.
-        """
-        if not self._by_number:
-            return last - key > RESTART_NS
-        return key < last and (
-            stamp_ns > last_ns or last_ns - stamp_ns > RESTART_NS or last - key > self._max_waiting
-        )
 
     def _release(self) -> list[Exposure]:
         """Remove and return the exposures that no longer have to wait."""

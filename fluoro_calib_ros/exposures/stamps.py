@@ -12,12 +12,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
+from enum import Enum
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 NS_PER_S = 1_000_000_000
+# A stamp earlier than the latest one by more than this starts a new stream; else it is late.
+RESTART_NS = 1_000_000_000
 RECENT = 200  # number of exposures that are compared
 MIN_EXPOSURES = 5
 # Difference of stamps, as a fraction of the frame interval, from which another frame is nearer.
@@ -27,6 +30,21 @@ MAX_PART = 0.5
 def nanoseconds_from_stamp(stamp: Any) -> int:
     """Return the time [ns] of an object with fields sec and nanosec, such as a Time message."""
     return int(stamp.sec * NS_PER_S + stamp.nanosec)
+
+
+class Order(Enum):
+    """Place of a stamp in its stream: after the latest stamp, or not, or after a restart."""
+
+    IN_ORDER = 'in order'
+    LATE = 'late'
+    RESTART = 'restart'
+
+
+def order_of(stamp_ns: int, latest_ns: int) -> Order:
+    """Return the place of a stamp after the latest one of its stream [ns]."""
+    if stamp_ns > latest_ns:
+        return Order.IN_ORDER
+    return Order.RESTART if latest_ns - stamp_ns > RESTART_NS else Order.LATE
 
 
 class StampedFrame(Protocol):

@@ -920,14 +920,17 @@ def test_clock_closes_blocks_and_goes_on_after_a_restart():
     assert clock.advance(3 + half) == 100 + 5 * half and clock.newest_ns == newest + half
 
 
-def test_late_frames_in_a_row_start_a_stream_anew():
+@pytest.mark.parametrize('calls', [1, 15])
+def test_late_exposures_in_a_row_start_a_stream_anew(calls):
+    """An exposure of six fluoroscopes is added in 15 pairs, and counts once."""
     clock = BlockClock(0.5)
     clock.advance(10**9)
-    for _ in range(100):
-        clock.advance(10**9 - 10)
+    for late_ns in range(210, 110, -1):
+        for _ in range(calls):
+            clock.advance(10**9 - late_ns)
     assert clock._offset_ns == 0
-    clock.advance(10**9 - 10)
-    assert clock._offset_ns == 10
+    clock.advance(10**9 - 110)
+    assert clock._offset_ns == 110
 
 
 # ---- one pair of views

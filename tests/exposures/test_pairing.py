@@ -15,6 +15,7 @@ from fluoro_calib_ros.exposures.pairing import (
     RecordedPairing,
     exposure_pairer,
 )
+from fluoro_calib_ros.exposures.stamps import Order, order_of
 
 MS = 1_000_000
 BY = ('frame_number', 'stamp')
@@ -254,6 +255,20 @@ def test_a_restarted_stream_releases_waiting_frames():
         (500, {'a', 'b'})
     ]
     assert pairer.unpaired == {'a': 1, 'b': 0, 'c': 0}
+
+
+@pytest.mark.parametrize(
+    ('stamp_ns', 'order'),
+    [
+        (5 * 10**9 + 1, Order.IN_ORDER),
+        (5 * 10**9, Order.LATE),
+        (4 * 10**9, Order.LATE),
+        (4 * 10**9 - 1, Order.RESTART),
+        (0, Order.RESTART),
+    ],
+)
+def test_a_stamp_is_in_order_late_or_after_a_restart(stamp_ns, order):
+    assert order_of(stamp_ns, 5 * 10**9) is order
 
 
 @pytest.mark.parametrize('by', BY)

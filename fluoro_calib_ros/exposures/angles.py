@@ -22,6 +22,7 @@ import numpy as np
 
 from ..options import option, validate_options
 from .frame import MAX_ANGLE, angle_in_degrees
+from .stamps import Order, order_of
 
 CAPACITY = 10_000  # maximum number of states of a joint in a live track
 
@@ -99,20 +100,18 @@ class AngleTrack:
     """Positions of a joint by stamp.
 
     A position that is not finite, or not an angle in radians, counts as unknown. A state older
-    than max_age_s gives no angle. The newest `capacity` states are kept, all for None. A state
-    earlier than all kept ones means that the clock was set back; the track then starts anew. late
-    counts the states that were added after the angle at or after their stamp had been requested:
-    the answer would have been different.
+    than max_age_s gives no angle. The newest `capacity` states are kept, all for None, as of a
+    recording. A live track starts anew if the clock is set back, as `order_of` tells. late counts
+    the states that were added after the angle at or after their stamp had been requested: the
+    answer would have been different.
     """
 
     def __init__(self, max_age_s: float, capacity: int | None = CAPACITY) -> None:
         self._max_age_ns = round(max_age_s * 1e9)
         self._capacity = capacity
-        self._is_cut = False
-        self._stamps = array('q')
-        self._angles = array('d')
         self._asked: int | None = None
         self.late = 0
+        self._clear()
 
     def add(self, stamp_ns: int, angle: float) -> None:
         """Add a state: angle [rad], rounded like that of a `Frame`.
@@ -122,7 +121,8 @@ class AngleTrack:
         angle = float(np.radians(angle_in_degrees(angle)))
         if not abs(angle) <= MAX_ANGLE:
             angle = math.nan
-        if self._is_cut and stamp_ns < self._stamps[0]:
+        order = order_of(stamp_ns, self._stamps[-1]) if self._stamps else Order.IN_ORDER
+        if order is Order.RESTART and self._capacity is not None:
             self._clear()
         index = len(self._stamps)
         if index and stamp_ns <= self._stamps[-1]:
@@ -137,7 +137,6 @@ class AngleTrack:
             half = len(self._stamps) // 2
             del self._stamps[:half]
             del self._angles[:half]
-            self._is_cut = True
 
     def at(self, stamp_ns: int) -> float | None:
         """Return the angle at a time [rad], None if unknown."""
@@ -166,7 +165,6 @@ class AngleTrack:
         return ''
 
     def _clear(self) -> None:
-        self._is_cut = False
         self._stamps = array('q')
         self._angles = array('d')
         self._asked = None

@@ -36,7 +36,7 @@ def test_angle_does_not_depend_on_the_order_in_which_states_arrive():
     shuffled = list(states)
     random.Random(1).shuffle(shuffled)
     times = [k * S // 170 for k in range(700)]
-    one, other = track(states), track(shuffled)
+    one, other = track(states), track(shuffled, capacity=None)
     assert [one.at(t) for t in times] == [other.at(t) for t in times]
 
 
@@ -50,12 +50,25 @@ def test_newest_states_are_kept_and_give_the_same_angles():
     assert complete.at(S) is not None and short.at(S) is None
 
 
-def test_clock_that_is_set_back_begins_anew():
-    found = track([(k * S, 0.001 * k) for k in range(1000, 2000)], capacity=10)
-    found.add(S, 0.5)
-    assert found.at(S) == pytest.approx(0.5)
-    found.add(2 * S, 0.6)
-    assert found.at(2 * S) == pytest.approx(0.6)
+@pytest.mark.parametrize(('capacity', 'back_s'), [(10, 2), (10, 9), (10_000, 2), (10_000, 900)])
+def test_clock_that_is_set_back_begins_anew(capacity, back_s):
+    """Between the new states lie those of the former run, which no longer count."""
+    found = track([(k * S // 4, 0.1) for k in range(4000)], capacity=capacity)
+    begin_ns = (1000 - back_s) * S
+    for k in range(4):
+        found.add(begin_ns + k * S // 2, 0.5)
+        assert found.at(begin_ns + k * S // 2 + S // 3) == pytest.approx(0.5)
+    assert found.late == 0
+
+
+def test_state_out_of_order_is_used_live():
+    found = track([(S, 0.1), (2 * S, 0.2), (S + S // 2, 0.3)])
+    assert found.at(2 * S - 1) == pytest.approx(0.3) and found.at(2 * S) == pytest.approx(0.2)
+
+
+def test_recorded_states_are_all_kept_when_the_clock_is_set_back():
+    found = track([(10 * S, 0.1), (20 * S, 0.2), (S, 0.3)], capacity=None)
+    assert [found.at(k * S) for k in (1, 10, 20)] == pytest.approx([0.3, 0.1, 0.2])
 
 
 @pytest.mark.parametrize('position', [math.nan, math.inf, 90.0, -90.0])

@@ -350,7 +350,7 @@ class PartialPairer(_Counts):
         queue = self._queues[name]
         queue.append((key, frame))
         ready += self._release()
-        if len(queue) > self._max_waiting:
+        while len(queue) > self._max_waiting:
             queue.popleft()
             self.unpaired[name] += 1
             ready += self._release()

@@ -219,6 +219,17 @@ def test_a_single_view_waits_as_long_as_its_queue():
     assert pairer.unpaired == {'a': 2, 'b': 2, 'c': 0}
 
 
+@pytest.mark.parametrize('names', ['ab', 'abc'])
+def test_fewer_frames_wait_once_the_limit_is_lowered(names):
+    pairer = exposure_pairer(names, PairingOptions(waiting=64))
+    assert paired(pairer, [frame('a', row) for row in range(60)], flush=False) == []
+    pairer.use(PairingOptions(waiting=4))
+    assert paired(pairer, [frame('a', 60)], flush=False) == [] and pairer.unpaired['a'] == 57
+    frames = [frame(name, row) for row in range(61) for name in names[1:]]
+    rows = [row for row, views in paired(pairer, frames, flush=False) if 'a' in views]
+    assert rows == [57, 58, 59, 60]
+
+
 @pytest.mark.parametrize('count', [5, 200])
 @pytest.mark.parametrize('later', [True, False])
 def test_restarted_streams(count, later):

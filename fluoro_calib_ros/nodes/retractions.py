@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Generic, TypeVar
 
 import numpy as np
 from fluoro_calib_msgs.msg import Retraction
+from numpy.typing import ArrayLike, NDArray
 
 from ..bodies.body import BodyPoses, PoseStatus
 from ..bodies.tracking import unknown_motion
@@ -27,6 +29,41 @@ from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'
 MAX_IDS = 10_000  # maximum number of ids in a retraction that is stored
+
+
+E = TypeVar('E')
+K = TypeVar('K', bound=Hashable)
+
+
+class PublishedExposures(Generic[K, E]):
+    """Keeps published exposures, and ids that were retracted before their exposure came.
+
+    retract: called with an exposure and the ids to retract from it. Calls may come from several
+    threads: views and retractions do.
+    """
+
+    def __init__(self, retract: Callable[[E, ArrayLike], None]) -> None:
+        self._retract = retract
+        self._exposures: OrderedDict[K, E] = OrderedDict()
+        self._early: OrderedDict[K, NDArray[np.integer]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def note(self, key: K, exposure: E) -> None:
+        """Store a published exposure, and retract from it what was retracted before."""
+        with self._lock:
+            remember(self._exposures, key, exposure)
+            if key in self._early:
+                self._retract(exposure, self._early.pop(key))
+
+    def take_back(self, key: K, target_id: ArrayLike) -> None:
+        """Retract ids of an exposure, now or when it comes."""
+        with self._lock:
+            if key in self._exposures:
+                self._retract(self._exposures[key], target_id)
+                return
+            retracted_ids = np.union1d(self._early.get(key, target_id), target_id)
+            if len(retracted_ids) <= MAX_IDS:
+                remember(self._early, key, retracted_ids)
 
 
 @dataclass
@@ -46,37 +83,24 @@ class BodyRetractions:
 
     def __init__(self, publish: Callable[[BodiesContent], None]) -> None:
         self._publish = publish
-        # By stamp of the exposure [ns]; _early: marker ids retracted before the exposure is noted.
-        self._published: OrderedDict[int, _Published] = OrderedDict()
-        self._early: OrderedDict[int, set[int]] = OrderedDict()
-        self._lock = threading.Lock()  # exposures and retractions come from different threads
+        # By stamp of the exposure [ns].
+        self._published: PublishedExposures[int, _Published] = PublishedExposures(self._retract)
         self.count = 0  #: number of retracted poses
 
     def note(self, content: BodiesContent) -> None:
         """Store a published exposure."""
-        with self._lock:
-            remember(self._published, content.stamp_ns, _Published(content))
-            retracted_ids = self._early.pop(content.stamp_ns, None)
-            if retracted_ids:
-                self._take_back(self._published[content.stamp_ns], retracted_ids)
+        self._published.note(content.stamp_ns, _Published(content))
 
-    def take_back(self, stamp_ns: int, target_id: Collection[int]) -> None:
+    def take_back(self, stamp_ns: int, target_id: ArrayLike) -> None:
         """Retract the poses of an exposure, possibly a future one, that use some markers."""
-        with self._lock:
-            published = self._published.get(stamp_ns)
-            if published is not None:
-                self._take_back(published, target_id)
-            else:
-                retracted_ids = self._early.get(stamp_ns, set()) | set(target_id)
-                remember(self._early, stamp_ns, retracted_ids)
+        self._published.take_back(stamp_ns, target_id)
 
-    def _take_back(self, published: _Published, target_id: Collection[int]) -> None:
+    def _retract(self, published: _Published, target_id: ArrayLike) -> None:
         content = published.content
-        retracted_ids = np.array(list(target_id))
         rows = [
             row
             for row, (poses, used) in enumerate(zip(content.poses, content.used))
-            if poses.body not in published.retracted and np.isin(used, retracted_ids).any()
+            if poses.body not in published.retracted and np.isin(used, target_id).any()
         ]
         if not rows:
             return
@@ -120,9 +144,9 @@ class PointRetractions:
             Retraction, f'reconstruction/{TOPIC}', observations_qos()
         )
         # By fluoroscope and stamp of a view [ns].
-        self._exposures: OrderedDict[tuple[str, int], PointsContent] = OrderedDict()
-        self._early: OrderedDict[tuple[str, int], Retraction] = OrderedDict()
-        self._lock = threading.Lock()  # views and retractions come from different threads
+        self._published: PublishedExposures[tuple[str, int], PointsContent] = PublishedExposures(
+            self._retract
+        )
         self.bodies = BodyRetractions(_nowhere)  #: retracts poses determined from these points
         self._count = 0  # retracted points
 
@@ -134,23 +158,16 @@ class PointRetractions:
 
     def note(self, stamps_ns: Mapping[str, int], content: PointsContent) -> None:
         """Store a reconstructed exposure by the stamps of its views."""
-        with self._lock:
-            for key in stamps_ns.items():
-                remember(self._exposures, key, content)
-                if key in self._early:
-                    self._publish(content, self._early.pop(key))
+        for key in stamps_ns.items():
+            self._published.note(key, content)
 
     def on_retraction(self, name: str, message: Retraction) -> None:
         """Retract points of an exposure, or store the retraction until the exposure arrives."""
-        key = name, nanoseconds_from_stamp(message.header.stamp)
-        with self._lock:
-            if key in self._exposures:
-                self._publish(self._exposures[key], message)
-            elif len(message.target_id) <= MAX_IDS:
-                remember(self._early, key, message)
+        stamp_ns = nanoseconds_from_stamp(message.header.stamp)
+        self._published.take_back((name, stamp_ns), message.target_id)
 
-    def _publish(self, content: PointsContent, message: Retraction) -> None:
-        retracted_ids = np.intersect1d(content.target_id, message.target_id)
+    def _retract(self, content: PointsContent, target_id: ArrayLike) -> None:
+        retracted_ids = np.intersect1d(content.target_id, target_id)
         if not len(retracted_ids):
             return
         out = Retraction(frame_number=content.frame_number, target_id=uint32_field(retracted_ids))
@@ -158,7 +175,7 @@ class PointRetractions:
         out.header.frame_id = content.orientation.frame_id
         self._output.publish(out)
         self._count += len(retracted_ids)
-        self.bodies.take_back(content.stamp_ns, retracted_ids.tolist())
+        self.bodies.take_back(content.stamp_ns, retracted_ids)
 
     def values(self) -> dict[str, int]:
         """Return the counts for the diagnostics."""

@@ -189,7 +189,7 @@ class ReconstructionNode(StreamNode):
     def create_outputs(self) -> None:
         """Create the outputs and subscribe to orientations."""
         self._output = PointsOutput(self)
-        self._retractions = PointRetractions(self)
+        self._retractions = PointRetractions(self, self._names, self._refusals)
         self._create_bodies()
         drift = self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)
         self.own(drift, self.destroy_publisher, drift)
@@ -229,7 +229,6 @@ class ReconstructionNode(StreamNode):
                 latched_qos(),
                 self._refusals,
             )
-            self._retractions.listen(name, self._refusals)
 
     def create_readers(self) -> None:
         """Receive the corrected observations of all fluoroscopes in one thread."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Generic, TypeVar
@@ -24,7 +24,7 @@ from .messages.observations import stamp_from_nanoseconds, uint32_field
 from .messages.points import PointsContent
 from .runtime.diagnostics import RefusalLog
 from .runtime.lifecycle import StreamNode
-from .runtime.streams import remember
+from .runtime.streams import REMEMBERED, remember
 from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'
@@ -38,12 +38,13 @@ K = TypeVar('K', bound=Hashable)
 class PublishedExposures(Generic[K, E]):
     """Keeps published exposures, and ids that were retracted before their exposure came.
 
-    retract: called with an exposure and the ids to retract from it. Calls may come from several
-    threads: views and retractions do.
+    retract: called with an exposure and the ids to retract from it. keys: number of keys of an
+    exposure. Calls may come from several threads: views and retractions do.
     """
 
-    def __init__(self, retract: Callable[[E, ArrayLike], None]) -> None:
+    def __init__(self, retract: Callable[[E, ArrayLike], None], keys: int = 1) -> None:
         self._retract = retract
+        self._most = REMEMBERED * keys
         self._exposures: OrderedDict[K, E] = OrderedDict()
         self._early: OrderedDict[K, NDArray[np.integer]] = OrderedDict()
         self._lock = threading.Lock()
@@ -51,7 +52,7 @@ class PublishedExposures(Generic[K, E]):
     def note(self, key: K, exposure: E) -> None:
         """Store a published exposure, and retract from it what was retracted before."""
         with self._lock:
-            remember(self._exposures, key, exposure)
+            remember(self._exposures, key, exposure, self._most)
             if key in self._early:
                 self._retract(exposure, self._early.pop(key))
 
@@ -63,7 +64,7 @@ class PublishedExposures(Generic[K, E]):
                 return
             retracted_ids = np.union1d(self._early.get(key, target_id), target_id)
             if len(retracted_ids) <= MAX_IDS:
-                remember(self._early, key, retracted_ids)
+                remember(self._early, key, retracted_ids, self._most)
 
 
 @dataclass
@@ -136,25 +137,22 @@ def _unknown_pose(poses: BodyPoses) -> BodyPoses:
 
 
 class PointRetractions:
-    """Retracts the points of exposures that rely on withdrawn image points."""
+    """Retracts the points of exposures that rely on withdrawn image points of fluoroscopes."""
 
-    def __init__(self, node: StreamNode) -> None:
-        self._node = node
+    def __init__(self, node: StreamNode, names: Sequence[str], refusals: RefusalLog) -> None:
         self._output = node.create_output(
             Retraction, f'reconstruction/{TOPIC}', observations_qos()
         )
         # By fluoroscope and stamp of a view [ns].
         self._published: PublishedExposures[tuple[str, int], PointsContent] = PublishedExposures(
-            self._retract
+            self._retract, keys=len(names)
         )
         self.bodies = BodyRetractions(_nowhere)  #: retracts poses determined from these points
         self._count = 0  # retracted points
-
-    def listen(self, name: str, refusals: RefusalLog) -> None:
-        """Subscribe to the retractions of a fluoroscope."""
-        on_retraction = partial(self.on_retraction, name)
-        topic = f'{name}/{TOPIC}'
-        self._node.create_input(Retraction, topic, on_retraction, observations_qos(), refusals)
+        for name in names:
+            on_retraction = partial(self.on_retraction, name)
+            topic = f'{name}/{TOPIC}'
+            node.create_input(Retraction, topic, on_retraction, observations_qos(), refusals)
 
     def note(self, stamps_ns: Mapping[str, int], content: PointsContent) -> None:
         """Store a reconstructed exposure by the stamps of its views."""

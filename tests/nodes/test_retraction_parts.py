@@ -10,6 +10,7 @@ from fluoro_calib_msgs.msg import Retraction
 
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds, uint32_field
 from fluoro_calib_ros.nodes.retractions import MAX_IDS, PointRetractions
+from fluoro_calib_ros.nodes.runtime.streams import REMEMBERED
 
 NAMES = 'abcdef'
 
@@ -18,7 +19,8 @@ def retractions():
     """Return retractions of points and a list of the ids that they publish."""
     published = []
     output = SimpleNamespace(publish=lambda message: published.append(list(message.target_id)))
-    return PointRetractions(SimpleNamespace(create_output=lambda *_: output)), published
+    node = SimpleNamespace(create_output=lambda *_: output, create_input=lambda *_: None)
+    return PointRetractions(node, NAMES, None), published
 
 
 def content(stamp_ns, target_id=range(1, 9)):
@@ -53,3 +55,23 @@ def test_early_retractions_of_an_exposure_are_limited():
     points.on_retraction('a', retraction(7, [MAX_IDS]))
     points.note({'a': 7}, content(7, range(MAX_IDS + 1)))
     assert published == [list(range(MAX_IDS))]
+
+
+def test_points_of_as_many_exposures_are_kept_whatever_the_number_of_fluoroscopes():
+    points, published = retractions()
+    for stamp_ns in range(REMEMBERED + 1):
+        points.note(dict.fromkeys(NAMES, stamp_ns), content(stamp_ns))
+    points.on_retraction('a', retraction(0, [3]))
+    assert not published
+    points.on_retraction('a', retraction(1, [3]))
+    points.on_retraction('f', retraction(1, [4]))
+    assert published == [[3], [4]]
+
+
+def test_as_many_early_retractions_are_kept_whatever_the_number_of_fluoroscopes():
+    points, published = retractions()
+    for stamp_ns in range(REMEMBERED):
+        for name in NAMES:
+            points.on_retraction(name, retraction(stamp_ns, [3]))
+    points.note(dict.fromkeys(NAMES, 0), content(0))
+    assert published == [[3]] * len(NAMES)

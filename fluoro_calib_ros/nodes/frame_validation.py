@@ -124,8 +124,8 @@ def validate_corrected(fluoroscope: str, frame: CorrectedFrame) -> None:
     if len(set(frame.target_id.tolist())) < count:
         raise Refused('repeated target', f'{where}: a target occurs more than once')
     for name, invalid in (
-        ('sigma', frame.sigma <= 0),
-        ('correction_sd', frame.correction_sd < 0),
+        ('sigma', (frame.sigma <= 0) | (frame.sigma == np.inf)),
+        ('correction_sd', (frame.correction_sd < 0) | (frame.correction_sd == np.inf)),
     ):  # false for NaN
         if invalid.any():
             raise Refused(

@@ -170,7 +170,8 @@ class Intersector:
             (F, n, 2), corrected pixels in the order of the orientation's fluoroscopes, NaN where a
             fluoroscope does not see a point.
         sigma : array_like
-            (F, n), standard deviations of the coordinates [px].
+            (F, n), standard deviations of the coordinates [px]; a coordinate with an infinite one
+            counts as not seen.
         outside : array_like, optional
             (F, n), True for image points beyond the calibrated area.
         scatter : ObservedScatter, optional
@@ -194,17 +195,21 @@ class Intersector:
                 f'not {uv.shape} and {sigma.shape}'
             )
         with np.errstate(all='ignore'):
-            points = self._intersect(uv.transpose(1, 0, 2), sigma.T**-2.0, scatter)
+            weight = sigma.T**-2.0
+            points = self._intersect(uv.transpose(1, 0, 2), weight, scatter)
         if outside is not None and np.any(outside):
-            used = np.isfinite(sigma) & (np.arange(self._count)[:, None] != points.dropped_view)
+            used = (weight.T > 0) & (np.arange(self._count)[:, None] != points.dropped_view)
             points.status[(points.status == OK) & (used & outside).any(axis=0)] = OUTSIDE
         return points
 
     def _intersect(
         self, uv: NDArray[np.float64], weight: NDArray[np.float64], scatter: ObservedScatter | None
     ) -> IntersectedPoints:
-        """Intersect image points uv (n, F, 2), weights (n, F) [1/px^2], both NaN where unseen."""
-        seen = np.isfinite(uv.sum(axis=2) + weight)
+        """Intersect image points uv (n, F, 2), NaN where unseen.
+
+        weight (n, F) [1/px^2]: NaN or 0 where unseen.
+        """
+        seen = np.isfinite(uv.sum(axis=2) + weight) & (weight > 0)
         rays = seen.sum(axis=1)
         if rays.min(initial=self._count) == self._count:  # the usual frame needs no masks
             return self._classified(uv, weight, rays, self._solve(uv, weight, rays), scatter)

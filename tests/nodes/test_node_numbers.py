@@ -250,7 +250,9 @@ def corrected(**changes):
         ({'status': np.zeros(1)}, 'lengths'),
         ({'target_id': np.array([4, 4])}, 'repeated target'),
         ({'sigma': np.array([0.2, 0.0])}, 'sigma'),
+        ({'sigma': np.array([0.2, np.inf])}, 'sigma'),
         ({'correction_sd': np.array([0.2, -0.1])}, 'sigma'),
+        ({'correction_sd': np.array([0.2, np.inf])}, 'sigma'),
     ],
 )
 def test_corrected_frame_is_validated(changes, kind):

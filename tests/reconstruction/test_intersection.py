@@ -3,7 +3,7 @@
 
 """Points in space: orientation, epipolar check, intersection, matching of views, recordings."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pycolmap
@@ -405,6 +405,23 @@ def test_points_seen_by_few_fluoroscopes():
     assert np.isnan(found.xyz_mm[3:5]).all() and np.isnan(found.residual[3:5]).all()
     nothing = Intersector(orientation).intersect(uv[:, 3:5], sigma[:, 3:5])
     assert nothing.status.tolist() == [SINGLE_VIEW] * 2
+
+
+def test_ray_with_an_infinite_standard_deviation_counts_as_not_seen():
+    orientation = orientation_of(('a', 'b', 'c'))
+    _, uv, sigma = seen(orientation, 6)
+    outside = np.zeros((3, 6), dtype=bool)
+    outside[2, 1] = True
+    with_ray, without_ray = sigma.copy(), sigma.copy()
+    with_ray[2, :3] = np.inf
+    without_ray[2, :3] = np.nan
+    found, expected = (
+        Intersector(orientation).intersect(uv, of_case, outside)
+        for of_case in (with_ray, without_ray)
+    )
+    assert found.rays.tolist() == [2, 2, 2, 3, 3, 3] and not found.status.any()
+    for field in fields(found):
+        assert np.array_equal(getattr(found, field.name), getattr(expected, field.name))
 
 
 def test_points_outside_the_calibrated_area_have_a_status():

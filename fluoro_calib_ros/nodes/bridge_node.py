@@ -37,6 +37,7 @@ from .runtime.parameters import ParameterGroup, ParameterNode
 from .runtime.topics import (
     DISCOVERY_S,
     IMAGE_DEPTH,
+    RECORDED_LATCHED_DEPTH,
     TopicDiscovery,
     adapted_qos,
     definition_of,
@@ -189,7 +190,7 @@ class _Shown:
     kind: type
     channel: Any
     subscription: Subscription | None = None
-    last: bytes = b''  # last message of a latched topic, else empty
+    is_latched: bool = False  #: whether publishers send their last messages to new subscriptions
 
 
 class BridgeNode(ParameterNode):
@@ -203,7 +204,7 @@ class BridgeNode(ParameterNode):
         self._shown: dict[str, _Shown] = {}
         self._lock = threading.Lock()
         self._readers: Counter[str] = Counter()  # by topic; changed by server threads
-        self._newcomers: set[str] = set()  # topics with a reader who missed the latched message
+        self._newcomers: set[str] = set()  # topics with a reader who missed the latched messages
         self._limited_logger = RateLimitedLogger(self.get_logger())
         self._token = settings.token or secrets.token_urlsafe(16)
         self._server = self._start_server()
@@ -270,9 +271,9 @@ class BridgeNode(ParameterNode):
             elif shown.topic not in read_topics and shown.subscription is not None:
                 self.destroy_subscription(shown.subscription)
                 shown.subscription = None
-                shown.last = b''
-            elif shown.topic in newcomers and shown.last:
-                shown.channel.log(shown.last)
+            elif shown.topic in newcomers and shown.is_latched:
+                self.destroy_subscription(shown.subscription)
+                self._subscribe(shown)
 
     def _discover(self) -> None:
         for topic, types, publishers in self._topics_of_graph.new():
@@ -289,15 +290,11 @@ class BridgeNode(ParameterNode):
 
     def _subscribe(self, shown: _Shown) -> None:
         qos = adapted_qos(self.get_publishers_info_by_topic(shown.topic), IMAGE_DEPTH)
-        is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-
-        def on_message(data: bytes) -> None:
-            shown.channel.log(data)
-            if is_latched:
-                shown.last = data
-
+        shown.is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        if shown.is_latched:
+            qos.depth = RECORDED_LATCHED_DEPTH
         shown.subscription = self.create_subscription(
-            shown.kind, shown.topic, on_message, qos, raw=True
+            shown.kind, shown.topic, shown.channel.log, qos, raw=True
         )
 
     def stop(self) -> None:

@@ -3,18 +3,22 @@
 
 """The bridge: what Foxglove receives over its WebSocket protocol."""
 
-import asyncio
 import json
 import os
 import re
 import socket
 import struct
 import sys
+from contextlib import ExitStack
 
 import pytest
 from fluoro_calib_msgs.msg import CalibrationStatus
+from geometry_msgs.msg import TransformStamped
 from rclpy.serialization import deserialize_message
 from ros_graph import NAMES, Process, entry_point
+from tf2_msgs.msg import TFMessage
+
+from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 PROTOCOL = ['foxglove.sdk.v1']
 
@@ -28,44 +32,72 @@ def test_without_the_sdk_it_says_what_to_install(tmp_path, ros, monkeypatch):
     assert 'pip install foxglove-sdk' in node.log and 'Traceback' not in node.log
 
 
-def test_foxglove_receives_the_messages_with_their_definition(graph, tmp_path):
-    from websockets.asyncio.client import connect
+class Foxglove:
+    """Client that subscribes to a topic by the protocol of Foxglove."""
 
+    def __init__(self, socket, topic):
+        self.socket = socket
+        self.topic = topic
+        self.channel = None
+        self.subscription = ''
+
+    def receive(self):
+        """Return the next message, a CDR."""
+        while True:
+            message = self.socket.recv(60)
+            if isinstance(message, bytes):
+                assert message[0] == 1 and struct.unpack_from('<I', message, 1)[0] == 7
+                return message[13:]
+            document = json.loads(message)
+            for channel in document.get('channels', ()):
+                if channel['topic'] == self.topic:
+                    self.channel = channel
+                    wanted = [{'id': 7, 'channelId': channel['id']}]
+                    self.subscription = json.dumps({'op': 'subscribe', 'subscriptions': wanted})
+                    self.socket.send(self.subscription)
+            if document['op'] == 'status':
+                # foxglove-sdk 0.30 advertises a channel just before it accepts subscribers.
+                assert document['message'].startswith('Unknown channel ID'), document
+                self.socket.send(self.subscription)
+
+
+def connected(graph, bridge):
+    """Return a connection, a context manager."""
+    from websockets.sync.client import connect
+
+    address = graph.client.wait_until(lambda: re.search(r'ws://\S+', bridge.log))[0]
+    return connect(address, subprotocols=PROTOCOL, max_size=None)
+
+
+def test_foxglove_receives_the_messages_with_their_definition(graph, tmp_path):
     graph.calibration_node(tmp_path / 'out')
     graph.fork = False
     bridge = graph.start('bridge_node', {'port': 0})
     topic = f'{graph.namespace}/a/calibration_status'
-    client = graph.client
-    address = client.wait_until(lambda: re.search(r'ws://\S+', bridge.log))[0]
-
-    async def foxglove():
-        async with connect(address, subprotocols=PROTOCOL, max_size=None) as socket:
-            subscription = ''
-            while True:
-                message = await asyncio.wait_for(socket.recv(), 60)
-                if isinstance(message, bytes):
-                    return message
-                document = json.loads(message)
-                for channel in document.get('channels', ()):
-                    if channel['topic'] == topic:
-                        offered.append(channel)
-                        wanted = [{'id': 7, 'channelId': channel['id']}]
-                        subscription = json.dumps({'op': 'subscribe', 'subscriptions': wanted})
-                        await socket.send(subscription)
-                if document['op'] == 'status':
-                    # foxglove-sdk 0.30 advertises a channel just before it accepts subscribers.
-                    assert document['message'].startswith('Unknown channel ID'), document
-                    await socket.send(subscription)
-
-    offered = []
-    data = asyncio.run(foxglove())
-    assert data[0] == 1 and struct.unpack_from('<I', data, 1)[0] == 7
-    status = deserialize_message(data[13:], CalibrationStatus)
+    with connected(graph, bridge) as socket:
+        foxglove = Foxglove(socket, topic)
+        status = deserialize_message(foxglove.receive(), CalibrationStatus)
     assert status.fluoroscope in NAMES and status.exposures == 0
-    (channel,) = offered
+    channel = foxglove.channel
     assert channel['encoding'] == 'cdr' and channel['schemaEncoding'] == 'ros2msg'
     assert channel['schemaName'] == 'fluoro_calib_msgs/msg/CalibrationStatus'
     assert 'float64 coverage' in channel['schema']
+
+
+def test_every_client_receives_the_last_message_of_each_publisher_of_a_latched_topic(graph):
+    frames = ('rig', 'robot')
+    topic = f'{graph.namespace}/tf_static'
+    publishers = [graph.client.create_publisher(TFMessage, topic, latched_qos()) for _ in frames]
+    for publisher, frame in zip(publishers, frames):
+        transform = TransformStamped(child_frame_id=frame)
+        publisher.publish(TFMessage(transforms=[transform]))
+    graph.client.wait_until(lambda: graph.client.count_publishers(topic) == 2)
+    bridge = graph.start('bridge_node', {'port': 0, 'topics': f'[{topic}]'})
+    with ExitStack() as sockets:
+        for _ in range(2):
+            foxglove = Foxglove(sockets.enter_context(connected(graph, bridge)), topic)
+            messages = [deserialize_message(foxglove.receive(), TFMessage) for _ in frames]
+            assert {m.transforms[0].child_frame_id for m in messages} == set(frames)
 
 
 def test_only_who_knows_the_token_and_no_foreign_page_is_let_through(graph):

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bodies.body import Body
-from ..exposures.stamps import Order, order_of
+from ..exposures.stamps import Order, StampOrder
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
@@ -346,11 +346,6 @@ def _alarm(level: Severity, estimate: DriftEstimate, place: str, since_s: float)
     )
 
 
-# Number of consecutive late exposures that start a new stream, such as a bag shorter than
-# RESTART_NS that is played in a loop. Exposures out of order are fewer.
-MAX_LATE = 100
-
-
 class BlockClock:
     """Clock of a stream.
 
@@ -362,7 +357,7 @@ class BlockClock:
         self._length_ns = round(block_s * 1e9)
         self._begin_ns: int | None = None  # start of the present block
         self._stamp_ns: int | None = None  # stamp of the last exposure
-        self._late = 0  # consecutive late exposures
+        self._order = StampOrder()
         self._offset_ns = 0  # added to stamps, so that time continues when a stream restarts
 
     def advance(self, stamp_ns: int) -> int | None:
@@ -374,16 +369,12 @@ class BlockClock:
         if stamp_ns == self._stamp_ns:
             return None
         self._stamp_ns = stamp_ns
-        time_ns = int(stamp_ns) + self._offset_ns
+        order = self._order.add(int(stamp_ns))
         if self._begin_ns is None:
-            self._begin_ns = self.newest_ns = time_ns
-            return None
-        order = order_of(time_ns, self.newest_ns)
-        self._late = self._late + 1 if order is Order.LATE else 0
-        if order is Order.RESTART or self._late > MAX_LATE:
-            self._late = 0
-            self._offset_ns += self.newest_ns - time_ns
-            time_ns = self.newest_ns
+            self._begin_ns = self.newest_ns = int(stamp_ns)
+        if order is Order.RESTART:
+            self._offset_ns = self.newest_ns - int(stamp_ns)
+        time_ns = int(stamp_ns) + self._offset_ns
         self.newest_ns = max(self.newest_ns, time_ns)
         ended = self._begin_ns
         if time_ns < ended + self._length_ns:

@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 NS_PER_S = 1_000_000_000
 # A stamp earlier than the latest one by more than this starts a new stream; else it is late.
 RESTART_NS = 1_000_000_000
+# Number of consecutive late stamps that start a new stream, such as that of a bag shorter than
+# RESTART_NS that is played in a loop. Exposures out of order are fewer.
+MAX_LATE = 100
 RECENT = 200  # number of exposures that are compared
 MIN_EXPOSURES = 5
 # Difference of stamps, as a fraction of the frame interval, from which another frame is nearer.
@@ -45,6 +48,26 @@ def order_of(stamp_ns: int, latest_ns: int) -> Order:
     if stamp_ns > latest_ns:
         return Order.IN_ORDER
     return Order.RESTART if latest_ns - stamp_ns > RESTART_NS else Order.LATE
+
+
+class StampOrder:
+    """Places of the stamps of one stream, of which many consecutive late ones are a restart."""
+
+    def __init__(self) -> None:
+        self._latest_ns: int | None = None
+        self._late = 0  # consecutive late stamps
+
+    def add(self, stamp_ns: int) -> Order:
+        """Add a stamp; return its place."""
+        latest_ns = self._latest_ns
+        order = Order.IN_ORDER if latest_ns is None else order_of(stamp_ns, latest_ns)
+        self._late = self._late + 1 if order is Order.LATE else 0
+        if self._late > MAX_LATE:
+            order = Order.RESTART
+        if order is not Order.LATE:
+            self._latest_ns = stamp_ns
+            self._late = 0
+        return order
 
 
 class StampedFrame(Protocol):

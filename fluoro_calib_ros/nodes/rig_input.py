@@ -19,6 +19,7 @@ from ..bodies.body import Body, solvable_bodies
 from ..bodies.tracking import BodyTracker, JointTracker, TrackedExposure, poses_of, twists_of
 from ..checks.rig_watch import RigDriftWatch
 from ..errors import DataError
+from ..exposures.stamps import Order, StampOrder
 from ..io.bodies import JointEntry, read_bodies, read_joints
 from ..io.calibration import load_orientation, orientation_path
 from ..io.versions import calibrated_orientation
@@ -125,9 +126,18 @@ class RigInput:
         return None
 
     def add(self, message: RigOrientation) -> bool:
-        """Use an orientation from now on; return False if it is refused."""
+        """Use an orientation from now on; return False if it is refused.
+
+        A known orientation, which is received again if its publisher restarts, keeps its watch: a
+        new watch would take a drift for the reference.
+        """
         try:
             orientation = orientation_from_message(message).subset(self._names)
+            ids = orientation.calibration_ids
+            known = self._rigs.get(ids)
+            if known is not None and known.orientation_id == message.orientation_id:
+                self._rigs = {**{i: rig for i, rig in self._rigs.items() if i != ids}, ids: known}
+                return True
             rig = Rig(
                 message.orientation_id,
                 orientation,
@@ -140,7 +150,6 @@ class RigInput:
             self._logger.error(f'orientation refused, the current one stays in use: {error}')
             return False
         self._log_jump(orientation)
-        ids = orientation.calibration_ids
         newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
         self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
         self._logger.info(f'{description_of(message)}, in use')
@@ -189,6 +198,10 @@ class RigInput:
 
     def renew_watches(self) -> None:
         """Restart all drift watches."""
+        if any(rig.watch is not None for rig in self._rigs.values()):
+            self._logger.warning(
+                'the drift watch starts anew: its reference is learned again, and an alarm ends'
+            )
         try:
             self._rigs = {
                 ids: rig._replace(watch=self._drift.make_watch(rig.orientation))
@@ -275,23 +288,22 @@ class BodyFollower:
         self.bodies = tuple(bodies)
         self._entries = tuple(joints)
         self._lag = lag
-        self.joints = self._new_joints()
-        self.state: BodiesState | None = None  #: None before the first exposure
-        self.untimed = 0  #: number of skipped exposures with the stamp of the one before
+        self._begin()
+        self.untimed = 0  #: number of skipped exposures, which are not later than the one before
         self._rig: Rig | None = None
         self._tracker: BodyTracker | None = None
-        self._last_ns = -1
-        self._squares = np.zeros((2, len(self.bodies)))  # chi-squared and expectation
+        self._order = StampOrder()
 
     def add(
         self, exposure: IntersectedViews, rig: Rig, number: int, stamp_ns: int
     ) -> list[BodiesContent]:
         """Add an exposure; return the contents of the exposures that are now ready for output.
 
-        A new tracker is started if the orientation or the rejection limit changes. So it is if a
-        stamp is earlier than the last one, because a recording has started again.
+        A new tracker is started if the orientation or the rejection limit changes. So it is if the
+        stamps restart, as if a recording is played again.
         """
-        begins_anew = stamp_ns < self._last_ns
+        order = self._order.add(stamp_ns)
+        begins_anew = order is Order.RESTART
         out = []
         if self._tracker is None or begins_anew or not self._is_same(rig):
             out = self._flushed()
@@ -299,11 +311,10 @@ class BodyFollower:
                 rig.orientation, self.bodies, rig.intersector.reject or np.inf, self._lag
             )
             if begins_anew:
-                self.joints = self._new_joints()
+                self._begin()
         self._tracker.use(rig.intersector.orientation)
         self._rig = rig
-        self.untimed += stamp_ns == self._last_ns
-        self._last_ns = stamp_ns
+        self.untimed += order is Order.LATE
         tracked = self._tracker.add(exposure, number, stamp_ns)
         return out if tracked is None else [*out, self._content(tracked)]
 
@@ -315,8 +326,11 @@ class BodyFollower:
             rig.intersector.reject,
         )
 
-    def _new_joints(self) -> list[JointTracker]:
-        return [JointTracker(entry.joint, entry.neutral) for entry in self._entries]
+    def _begin(self) -> None:
+        """Set the state before the first exposure of a stream."""
+        self.joints = [JointTracker(entry.joint, entry.neutral) for entry in self._entries]
+        self.state: BodiesState | None = None  #: None before the first exposure
+        self._squares = np.zeros((2, len(self.bodies)))  # chi-squared and expectation
 
     def _flushed(self) -> list[BodiesContent]:
         """Return the contents of exposures that wait for later ones, which will not come."""

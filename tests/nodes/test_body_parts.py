@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.anatomical_frames import AnatomicalFrame
 from fluoro_calib_ros.bodies.body import Body, BodyPoses, PoseStatus
-from fluoro_calib_ros.bodies.joints import Joint
+from fluoro_calib_ros.bodies.joints import Joint, JointStatus
 from fluoro_calib_ros.bodies.tracking import BodyTracker, poses_of, twists_of
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.bodies import JointEntry
@@ -100,11 +100,13 @@ def stamp(row):
     return 10**18 + round(1e9 * row / RATE_HZ)
 
 
-def follow(follower, rows, number=1, **kind):
+def follow(follower, rows, number=1, later_s=0, **kind):
     return [
         content
         for row in rows
-        for content in follower.add(exposure(row, **kind), rig(number), row + 1, stamp(row))
+        for content in follower.add(
+            exposure(row, **kind), rig(number), row + 1, stamp(row) + later_s * 10**9
+        )
     ]
 
 
@@ -273,11 +275,11 @@ def test_new_tracker_first_gives_what_waits(change):
     """No exposure is lost, and the new tracker starts without a motion."""
     follower = BodyFollower(BODIES, (), lag=5)
     assert len(follow(follower, range(10))) == 5
-    row, number = (10, 2) if change == 'orientation' else (0, 1)
-    rest = follow(follower, [row], number)
+    row, number, later_s = (10, 2, 0) if change == 'orientation' else (0, 1, -2)
+    rest = follow(follower, [row], number, later_s)
     assert [one.frame_number for one in rest] == [6, 7, 8, 9, 10]
     assert {one.orientation_id for one in rest} == {'rig-1'}
-    found = follow(follower, range(row + 1, row + 7), number)
+    found = follow(follower, range(row + 1, row + 7), number, later_s)
     assert found[0].frame_number == row + 1 and found[0].orientation_id == f'rig-{number}'
 
 
@@ -292,8 +294,8 @@ def test_angles_of_a_joint_are_those_from_its_neutral_trial_on():
         assert content.joints[0].angles == pytest.approx(np.array([[0.3, 0, 0]]), abs=1e-3)
         names = [f'knee_{name}' for name in content.joints[0].angle_names]
         assert list(joint_state(content).name) == names
-    for _ in range(2):
-        found = follow(zeroed, range(6))
+    for later_s in (0, -2):
+        found = follow(zeroed, range(6), later_s=later_s)
         assert [len(joint_state(content).position) for content in found] == [0, 0, 0, 3, 3, 3]
         for content in found[3:]:
             assert joint_state(content).position == pytest.approx([0, 0, 0], abs=1e-3)
@@ -357,6 +359,24 @@ def test_a_pose_that_waits_for_later_exposures_is_taken_back_after_it_is_publish
     for content in follow(follower, range(4, 6)):
         retractions.note(content)
     assert [(one.frame_number, one.bodies[0].name) for one in published] == [(4, 'femur')]
+
+
+def test_exposure_out_of_order_is_skipped_and_the_neutral_position_stays():
+    """As if frames of several fluoroscopes with different clocks are paired by number."""
+    joint = Joint('knee', 'femur', 'tibia', 'cardan_xyz')
+    follower = BodyFollower(BODIES, [JointEntry(joint, (2, 4))], lag=0)
+    follow(follower, range(6))
+    assert not follower.joints[0].needs_neutral
+    assert not follower.add(exposure(4), rig(), 7, stamp(5) - 500_000)
+    assert follower.untimed == 1 and not follower.joints[0].needs_neutral
+    assert follow(follower, [6])[0].joints[0].status[0] == JointStatus.OK
+
+
+def test_state_of_bodies_is_that_since_the_stamps_restarted():
+    follower = BodyFollower(BODIES, [], lag=0)
+    follow(follower, range(3))
+    follow(follower, [0], later_s=-2, visible=('femur',))
+    assert follower.state.seen_ns.tolist() == [stamp(0) - 2 * 10**9, -1]
 
 
 def test_exposure_with_the_stamp_of_the_one_before_is_counted():

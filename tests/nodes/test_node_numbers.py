@@ -7,6 +7,7 @@ from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace as Fake
 
+import body_views
 import numpy as np
 import pytest
 import rigs
@@ -50,6 +51,7 @@ from fluoro_calib_ros.nodes.frame_validation import (
     with_limit,
 )
 from fluoro_calib_ros.nodes.image_stream import ExposureQueue, ImageStream
+from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
 from fluoro_calib_ros.nodes.reconstruction_output import PointsCounter
 from fluoro_calib_ros.nodes.recorder_node import qos_document, type_hash_text
 from fluoro_calib_ros.nodes.rig_input import RigInput
@@ -508,6 +510,21 @@ def test_rig_is_the_newest_with_the_calibrations_of_all_views():
     assert made.rig_of({'a': 'a1', 'b': 'b2'}) is None
     assert made.rig_of({'a': 'a9', 'b': 'b1', 'c': 'c1'}) is None
     assert rig_input().newest is None and rig_input().camera_of('a') == ('', None)
+
+
+def test_orientation_that_is_received_again_keeps_its_watch():
+    """A new watch would take a drift for the reference, and end its alarm."""
+    watches = iter(['first', 'second', 'third'])
+    drift = Fake(make_watch=lambda _: next(watches))
+    logger = Fake(info=lambda _: None, warning=lambda _: None)
+    made = RigInput(('a', 'b'), 4.0, drift, refusals=None, logger=logger)
+    given = body_views.orientation()
+    healed = replace(given, position_mm=given.position_mm + 0.1)
+    other = replace(given, calibration_ids=('a2', 'b2'))
+    messages = [message_from_orientation(one) for one in (given, other, healed)]
+    assert made.add(messages[0]) and made.add(messages[1]) and made.add(messages[0])
+    assert made.newest.watch == 'first' and len(made._rigs) == 2
+    assert made.add(messages[2]) and made.newest.watch == 'third'
 
 
 # ---- simulator, player, recorder, bridge

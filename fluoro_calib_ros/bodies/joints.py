@@ -112,6 +112,8 @@ class JointMotion:
         Of angles and translations [rad, mm]; second moments of their errors near gimbal lock.
     status : (T,) ndarray
         JointStatus as uint8.
+    determined : (T,) ndarray
+        Whether there are angles away from gimbal lock, from which full turns are counted.
     """
 
     __repr__ = brief_repr
@@ -123,6 +125,7 @@ class JointMotion:
     translations: NDArray[np.float64]
     covariance: NDArray[np.float64]
     status: NDArray[np.uint8]
+    determined: NDArray[np.bool_]
 
     @property
     def angle_names(self) -> tuple[str, str, str]:
@@ -150,7 +153,7 @@ def joint_motion(
 
     The covariance does not include errors of the anatomical frames themselves, which are constant
     over all trials of a person. before: angles (3,) [rad] from which full turns are counted; in
-    live use, pass the last ones that are not GIMBAL to get the same values as for the whole trial.
+    live use, pass the last determined ones to get the same values as for the whole trial.
     Raises DataError for poses of other bodies or of different exposures.
     """
     _check_poses(joint, proximal, distal)
@@ -168,14 +171,16 @@ def joint_motion(
             rows = exposures[start : start + BLOCK]
             covariance[rows] = _second_moments(of, relative.of(rows), angles[rows], nodes)
     signs = np.array([*of.angle_signs, *of.translation_signs], dtype=float)
+    determined = np.isfinite(angles).all(axis=1) & ~locked
     return JointMotion(
         joint,
         proximal.number,
         proximal.stamp_ns,
-        angles=_unwrapped(angles * signs[:3], locked, before),
+        angles=_unwrapped(angles * signs[:3], determined, before),
         translations=_translations(of, axes, relative.translation) * signs[3:],
         covariance=covariance * signs[:, None] * signs,
         status=_status(proximal.status, distal.status, locked, angles),
+        determined=determined,
     )
 
 
@@ -450,14 +455,13 @@ def angle_errors(
 
 
 def _unwrapped(
-    angles: NDArray[np.float64], locked: NDArray[np.bool_], before: NDArray[np.float64] | None
+    angles: NDArray[np.float64], determined: NDArray[np.bool_], before: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
     """Return angles (T, 3) without jumps by full turns.
 
     Near gimbal lock noise may turn an angle, so each is compared with the last angle away from it.
     """
     known = np.isfinite(angles).all(axis=1)
-    determined = known & ~locked
     unwrapped = angles[determined]
     # Count whole turns, so that processing one exposure at a time gives the same values.
     turns = -np.cumsum(_turns(np.diff(unwrapped, axis=0, prepend=unwrapped[:1])), axis=0)
@@ -468,7 +472,7 @@ def _unwrapped(
         start = unwrapped[0] if len(unwrapped) else np.zeros(3)
     unwrapped = unwrapped + 2 * np.pi * turns
     out = np.concatenate([start[None], unwrapped])[np.cumsum(determined)]
-    near_lock = known & locked
+    near_lock = known & ~determined
     out[near_lock] = angles[near_lock] - 2 * np.pi * _turns(angles[near_lock] - out[near_lock])
     out[~known] = np.nan
     return out

@@ -342,8 +342,6 @@ def _poses(
 # Motion of a joint exposure by exposure, with the same values as for the whole trial.
 
 MAX_NEUTRAL = 10_000  # exposures of a neutral trial, some 60 MB
-# Statuses of angles from which full turns are counted; near gimbal lock angles may turn.
-_FIRM = (JointStatus.OK, JointStatus.WEAK, JointStatus.FILLED)
 
 
 class JointTracker:
@@ -379,7 +377,7 @@ class JointTracker:
         motion = joint_motion(self.joint, proximal, distal, self._last)
         if self.needs_neutral:
             return unknown_motion(motion)
-        if motion.status[0] in _FIRM:
+        if motion.determined[0]:
             self._last = motion.angles[0]
         return motion
 
@@ -423,4 +421,5 @@ def unknown_motion(motion: JointMotion) -> JointMotion:
         translations=np.full_like(motion.translations, np.nan),
         covariance=np.full_like(motion.covariance, np.nan),
         status=np.full_like(motion.status, JointStatus.FAILED),
+        determined=np.zeros_like(motion.determined),
     )

@@ -227,14 +227,16 @@ class LiveKnee:
         number = np.array([message.frame_number for message in messages])
         metres = np.repeat([1.0, 1e3], 3)
         covariance = np.array([message.covariance for message in messages]).reshape(-1, 6, 6)
+        angles = np.array([message.angle for message in messages])
         motion = JointMotion(
             self._knee.joint,
             number,
             np.array([nanoseconds_from_stamp(message.header.stamp) for message in messages]),
-            angles=np.array([message.angle for message in messages]),
+            angles=angles,
             translations=1e3 * np.array([message.translation for message in messages]),
             covariance=covariance * metres * metres[:, None],
             status=np.array([message.status[0] for message in messages]),
+            determined=np.isfinite(angles).all(axis=1),
         )
         write_bytes(picture, png_bytes(joint_figure(motion)))
         known = np.isfinite(motion.angles).all(axis=1)

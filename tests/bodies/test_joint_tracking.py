@@ -47,7 +47,7 @@ def trial():
 
 
 def one_by_one(tracker, trial):
-    rows = np.eye(COUNT, dtype=bool)
+    rows = np.eye(len(trial[0].number), dtype=bool)
     return [tracker.add(*(one.rows(row) for one in trial)) for row in rows]
 
 
@@ -59,6 +59,23 @@ def test_angles_are_those_of_the_whole_trial(trial):
     assert np.ptp(expected.angles[:, 0]) > 2 * np.pi
     covariance = np.concatenate([one.covariance for one in found])
     assert np.allclose(covariance, expected.covariance, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('degrees', 'status'),
+    [
+        ([[100, 0, 0], [170, 0, 0], [250, 0, 0], [330, 0, 0], [400, 0, 0]], PoseStatus.AMBIGUOUS),
+        ([[80, 70, 80], [150, 88.5, 150], [225, 89.5, 225], [250, 70, 250]], PoseStatus.FILLED),
+    ],
+)
+def test_full_turns_are_counted_as_in_the_whole_trial(degrees, status):
+    """From ambiguous poses as well, and not from filled ones near gimbal lock."""
+    tibia = poses('tibia', np.radians(degrees))
+    tibia.status[1:-1] = status
+    trial = poses('femur', np.zeros((len(degrees), 3))), tibia
+    found = one_by_one(JointTracker(JOINT), trial)
+    expected = joint_motion(JOINT, *trial).angles
+    assert np.allclose(np.concatenate([one.angles for one in found]), expected, atol=1e-12)
 
 
 def test_angles_after_the_neutral_trial_are_those_of_the_whole_trial(trial):

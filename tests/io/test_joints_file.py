@@ -164,6 +164,7 @@ def test_motion_of_joints_is_written(tmp_path):
         translations=10 * angles,
         covariance=covariance,
         status=np.array([JointStatus.OK, JointStatus.FAILED, JointStatus.GIMBAL], np.uint8),
+        determined=np.array([True, False, False]),
     )
     path = tmp_path / 'joints.csv'
     joint_table([motion, motion], 10**18).write(path)

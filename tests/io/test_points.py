@@ -1003,6 +1003,7 @@ def joint_of_two(name, count=3):
         translations=10 * angles,
         covariance=np.zeros((count, 6, 6)),
         status=np.zeros(count, np.uint8),
+        determined=np.isfinite(angles).all(axis=1),
     )
 
 

@@ -96,6 +96,8 @@ class Kind(str, Enum):
 
     # Orientation of the rig.
     NO_COMMON_TARGETS = 'no_common_targets'
+    TARGETS_EXCHANGED = 'targets_exchanged'
+    TARGETS_REJECTED = 'targets_rejected'
     NOISE_OBSERVED = 'noise_observed'
     PAIRS_CONTRADICT = 'pairs_contradict'
     PAIRS_EXCLUDED = 'pairs_excluded'

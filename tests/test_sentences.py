@@ -66,7 +66,7 @@ from fluoro_calib_ros.jobs.extraction import ImageResult, bent_shadows
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
-from fluoro_calib_ros.reconstruction import epipolar, observed_noise
+from fluoro_calib_ros.reconstruction import epipolar, lost_targets, observed_noise
 
 PHANTOM = rig().phantom
 CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
@@ -466,6 +466,8 @@ MAKERS = {
     Kind.NOISE_OBSERVED: lambda: observed_noise._finding(4.0, [Fake(image_sd=0.05)]),
     Kind.PAIRS_CONTRADICT: lambda: about_pairs(unexplained=20.0),
     Kind.PAIRS_EXCLUDED: lambda: about_pairs(used=np.arange(8) != 4),
+    Kind.TARGETS_EXCHANGED: lambda: lost_targets._exchange([3, 7], ['a', 'b']),
+    Kind.TARGETS_REJECTED: lambda: lost_targets._rejected([3, 7]),
     Kind.RAYS_DO_NOT_MEET: lambda: epipolar.missing_rays(0.9, epipolar.UNKNOWN),
     Kind.RIG_DEPENDS_ON_ANGLE: lambda: about_pairs(angle_px=1.5),
     Kind.RIG_MOVED: moved_rig,
@@ -650,6 +652,13 @@ SENTENCES = {
     ),
     Kind.FRAMES_SHIFTED: (
         '# % of the rays miss each other: the frame numbers of fluoroscope b are too small by #'
+    ),
+    Kind.TARGETS_EXCHANGED: (
+        'targets # and # are exchanged in fluoroscope a or b: most of their rays miss each other, '
+        'and meet with exchanged ids'
+    ),
+    Kind.TARGETS_REJECTED: (
+        'most rays of the targets #, # miss each other: check their ids in each fluoroscope'
     ),
     Kind.IDS_REVERSED: (
         'the target ids run in the opposite order: with the correct ids the image points fit the '

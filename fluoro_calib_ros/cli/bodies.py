@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import DataError, ErrorsAt
-from .arguments import add_oriented_source, add_out, number_in, options_of, read_oriented_source
+from ..findings import Severity
+from .arguments import (
+    add_exit_zero,
+    add_oriented_source,
+    add_out,
+    number_in,
+    options_of,
+    read_oriented_source,
+)
 from .output import ProgressBar, print_findings, print_notes, print_result, print_unpaired
 
 if TYPE_CHECKING:
@@ -77,10 +85,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='HZ',
         help='rate of the exposures, for files without times',
     )
+    add_exit_zero(parser)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Track the bodies of a recording; write poses and joints. Raises DataError."""
+def run(arguments: argparse.Namespace) -> bool:
+    """Track the bodies of a recording; write poses and joints. Raises DataError.
+
+    Returns whether the bodies are those of the recording, as far as the findings say.
+    """
     from ..io.bags.mcap_file import is_bag
     from ..io.bodies import read_bodies, read_joints
     from ..io.calibration import orientation_path
@@ -148,6 +160,7 @@ def run(arguments: argparse.Namespace) -> None:
         print_notes([f'{arguments.source}: {outcome.noise.sentence}'])
     print_findings(outcome.findings, 'doubtful: ')
     _print(arguments, outcome)
+    return all(finding.severity is not Severity.ERROR for finding in outcome.findings)
 
 
 def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:

@@ -401,9 +401,9 @@ def trial_row(
 ) -> dict[str, Any]:
     """Return the row of a trial in the table; calibration: verdict on the calibration.
 
-    The verdict is 'refused' if a command failed, 'fail' if the trial contradicts its calibration,
-    and 'cannot tell' instead of pass if its bodies are doubtful; otherwise that of the
-    calibration.
+    The verdict is 'refused' if a command failed, 'fail' if the trial contradicts its calibration
+    or its bodies, and 'cannot tell' instead of pass if targets or bodies are doubtful; otherwise
+    that of the calibration.
     """
     row: dict[str, Any] = {'trial': name, 'verdict': calibration, 'cause': ''}
     for step, done in steps:
@@ -435,7 +435,7 @@ def _reconstruction_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -
             'verdict': 'fail',
             'cause': 'the rays miss each other by more than their standard deviations allow',
         }
-    return cells
+    return cells | _doubts(row, document['lost_targets'])
 
 
 def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
@@ -446,12 +446,19 @@ def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[s
     for joint, angles in document['joints'].items():
         for name, angle in angles.items():
             cells |= {f'{joint}_{name}_{key}': angle[key] for key in ('range_deg', 'sd_deg')}
-    doubtful = [
-        finding['sentence'] for finding in document['findings'] if finding['severity'] != 'note'
-    ]
-    if doubtful and row['verdict'] == 'pass':
-        cells |= {'verdict': 'cannot tell', 'cause': '; '.join(doubtful)}
-    return cells
+    return cells | _doubts(row, document['findings'])
+
+
+def _doubts(row: Mapping[str, Any], findings: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return verdict and cause of a trial that would pass without these findings."""
+    doubtful = [finding for finding in findings if finding['severity'] != 'note']
+    if not doubtful or row['verdict'] != 'pass':
+        return {}
+    is_wrong = any(finding['severity'] == 'error' for finding in doubtful)
+    return {
+        'verdict': 'fail' if is_wrong else 'cannot tell',
+        'cause': '; '.join(finding['sentence'] for finding in doubtful),
+    }
 
 
 def _write_table(out: Path, rows: Sequence[Mapping[str, Any]]) -> Path:

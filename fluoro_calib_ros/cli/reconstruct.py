@@ -105,16 +105,15 @@ def run(arguments: argparse.Namespace) -> None:
     if outcome.noise is not None:
         print_note(f'{arguments.source}: {outcome.noise.sentence}')
     if outcome.widening > 1:
-        advice = (
-            'check the sigma of the image points, whether they are already corrected or count '
-            'from 1, and whether a fluoroscope has moved since its calibration'
-        )
         print_note(
             f'{arguments.source}: the rays miss each other by more than their standard deviations '
             f'allow; the limit of false matches was widened {outcome.widening:.1f} times, to '
-            f'{arguments.reject * outcome.widening:.1f} standard deviations; '
-            f'{outcome.cause or advice}'
+            f'{arguments.reject * outcome.widening:.1f} standard deviations; check the sigma of '
+            'the image points, whether they count from 1, how many are outside the calibrated '
+            'area, and whether a fluoroscope has moved since its calibration'
         )
+    for finding in outcome.lost_targets:
+        print_note(f'{arguments.source}: {finding}')
     _print(arguments, outcome)
 
 
@@ -134,6 +133,7 @@ def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> Non
         'unpaired': outcome.unpaired,
         'noise': None if outcome.noise is None else finding_document(outcome.noise),
         'widening': outcome.widening,
+        'lost_targets': [finding_document(finding) for finding in outcome.lost_targets],
         'drift': drift_document(outcome.drift, outcome.frames[0].stamp_ns),
         'orientation': orientation_document(outcome.orientation),
     }

@@ -26,6 +26,7 @@ from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import cause_of_misses, mismatch
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
+from ..reconstruction.lost_targets import lost_targets
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import (
     ReconstructedFrame,
@@ -78,8 +79,8 @@ class ReconstructionOutcome:
     widening : float
         Factor of the limit of false matches at the end; above 1 if the rays miss each other by
         more than their standard deviations allow.
-    cause : Finding or None
-        Cause of the widening, if the factor is at its maximum and a trial identifies the cause.
+    lost_targets : tuple of Finding
+        On targets that are rejected in most of their exposures.
     noise : Finding or None
         Set if image points have no sigma and their rays show more noise than the calibration.
     """
@@ -92,7 +93,7 @@ class ReconstructionOutcome:
     drift: DriftVerdict | None
     disagreement: str = ''
     widening: float = 1.0
-    cause: Finding | None = None
+    lost_targets: tuple[Finding, ...] = ()
     noise: Finding | None = None
 
     def to_dataframe(self, names: Names | None = None) -> pandas.DataFrame:
@@ -144,7 +145,8 @@ def reconstruct(
     ------
     DataError
         For calibrations to which the orientation does not belong, for frames that cannot be paired
-        or corrected, and if most rays do not meet.
+        or corrected, if most rays do not meet, and if all miss each other by a little and a trial
+        identifies the cause.
     """
     options = options or ReconstructionOptions()
     if options.pair_by == 'stamp' and not options.has_stamps:
@@ -169,11 +171,11 @@ def reconstruct(
     if not reconstructed:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
     finding = mismatch(reconstructed, frames, calibrations, intersector, options)
+    if finding is None and scatter.factor >= MAX_WIDENING:
+        finding = cause_of_misses(reconstructed, frames, calibrations, intersector, options)
     if finding is not None:
         raise DataError(finding)
-    cause = None
-    if scatter.factor >= MAX_WIDENING:
-        cause = cause_of_misses(reconstructed, frames, calibrations, intersector, options)
+    lost = lost_targets(reconstructed, frames, calibrations, intersector, options)
     disagreement = ''
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
@@ -185,7 +187,7 @@ def reconstruct(
         drift=drift,
         disagreement=disagreement,
         widening=scatter.factor,
-        cause=cause,
+        lost_targets=tuple(lost),
         noise=noise,
     )
 

@@ -279,7 +279,7 @@ def cause_of_misses(
     intersector: Intersector,
     pairing: RecordedPairing,
 ) -> Finding | None:
-    """Return why rays miss each other by more than expected, or None if no trial shows it.
+    """Return why rays miss each other by more than expected, or None if no trial identifies it.
 
     The trials are those of `mismatch`, and image points that are already corrected.
     """
@@ -298,7 +298,11 @@ def cause_of_misses(
         reconstructed, _ = reconstruct_recording(changed, trial_calibrations, intersector, pairing)
         misses.append(_miss(reconstructed))
     best = int(np.argmin(misses))
-    return trials[best][0] if misses[best] < limit else None
+    if not misses[best] < limit:
+        return None
+    found, _ = trials[best]
+    text = f'the rays miss each other by more than their standard deviations allow: {found.cause}'
+    return replace(found, cause=text)
 
 
 def _largest(reconstructed: Sequence[ReconstructedFrame]) -> set[int]:

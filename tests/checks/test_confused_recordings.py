@@ -442,10 +442,39 @@ def distorted():
 def test_points_that_are_corrected_already_are_recognised():
     held, observed = distorted()
     right = reconstruct(observed, held, orientation(), FROM_FILE)
-    assert right.cause is None and right.widening < 2
+    assert right.widening < 2 and not right.lost_targets
     corrected = changed(lambda f: f)
-    wrong = reconstruct(corrected, held, orientation(), FROM_FILE)
-    assert wrong.cause.kind is Kind.CORRECTED_ALREADY
+    with refused(Kind.CORRECTED_ALREADY):
+        reconstruct(corrected, held, orientation(), FROM_FILE)
+
+
+def with_ids_of_each_other(first, second):
+    """Return a change of frames that exchanges the ids of two targets."""
+
+    def change(frame):
+        ids = frame.target_id.copy()
+        ids[frame.target_id == first] = second
+        ids[frame.target_id == second] = first
+        return replace(frame, target_id=ids)
+
+    return change
+
+
+def test_targets_that_are_rejected_throughout_are_named():
+    """Two that are exchanged in b, and one whose image point in a is that of something else."""
+    a, b = (frames()[name][0] for name in 'ab')
+    one, two, other = np.intersect1d(a.target_id, b.target_id)[[0, 4, 8]].tolist()
+    some = {f.fluoroscope: [replace(f, number=k) for k in range(24)] for f in (a, b)}
+    assert not reconstruct(some, calibrations(), orientation(), FROM_FILE).lost_targets
+    wrong = {**some, 'b': [with_ids_of_each_other(one, two)(f) for f in some['b']]}
+    wrong['a'] = [
+        replace(f, uv=f.uv + np.sign(511 - f.uv) * 40.0 * (f.target_id == other)[:, None])
+        for f in wrong['a']
+    ]
+    pair, single = reconstruct(wrong, calibrations(), orientation(), FROM_FILE).lost_targets
+    assert pair.kind is Kind.TARGETS_EXCHANGED and pair.place.fluoroscopes == ('a', 'b')
+    assert pair.place.target_id == (one, two)
+    assert single.kind is Kind.TARGETS_REJECTED and single.place.target_id == (other,)
 
 
 def test_a_stream_whose_rays_miss_each_other_is_noticed_and_forgotten():

@@ -223,6 +223,27 @@ def test_a_body_whose_markers_nobody_sees_is_named(knee, tmp_path, capsys):
     assert {row['status'] for row in poses} == {'FAILED'} and not any(p['x_mm'] for p in poses)
 
 
+def test_mirrored_coordinates_are_not_a_success(knee, tmp_path, capsys):
+    """The poses are written, and the exit status is that of a verdict that is not pass."""
+    given = rows(knee / 'bodies.csv')
+    lines = [
+        ','.join(
+            [row['body'], row['marker'], str(-float(row['x'])), row['y'], row['z'], row['sd']]
+        )
+        for row in given
+    ]
+    (tmp_path / 'bodies.csv').write_text('\n'.join(['body,marker,x,y,z,sd', *lines]) + '\n')
+    arguments = (
+        *('bodies', knee / 'walking', '--bodies', tmp_path / 'bodies.csv', '--smooth', 'none'),
+        *('--calibration', knee / 'result', '--out', tmp_path / 'motion'),
+    )
+    assert run(*arguments, '--exit-zero') == 0
+    capsys.readouterr()
+    assert run(*arguments, '--json') == 3
+    document = json.loads(capsys.readouterr().out)
+    assert 'body_mirrored' in [f['kind'] for f in document['findings']]
+
+
 @pytest.mark.parametrize(
     ('text', 'cause'),
     [

@@ -389,7 +389,7 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         disagreement='',
         widening=widening,
         drift=Fake(widening=None),
-        cause=None,
+        lost_targets=[],
         noise=None,
         plot=None,
     )
@@ -668,7 +668,7 @@ def test_options_of_a_study_are_words_of_the_command(value, words):
 
 def document(**changes):
     values = {'frames': 5, 'points': 9, 'status': {'OK': 7}, 'widening': 1.0, 'drift': None}
-    return {**values, **changes}
+    return {**values, 'lost_targets': [], **changes}
 
 
 @pytest.mark.parametrize(
@@ -676,6 +676,7 @@ def document(**changes):
     [
         ({}, 'pass', ''),
         ({'widening': 1.2}, 'fail', 'rays'),
+        ({'lost_targets': [{'severity': 'warning', 'sentence': 's'}]}, 'cannot tell', 's'),
         ({'drift': {'kind': 'k', 'level': 'ok', 'message': 'm'}}, 'pass', ''),
         ({'drift': {'kind': 'k', 'level': 'warn', 'message': 'm'}}, 'fail', 'm'),
         ({'drift': {'kind': 'k', 'level': 'error', 'message': 'm'}}, 'fail', 'm'),

@@ -309,6 +309,9 @@ def test_doubt_about_a_body_makes_a_trial_doubtful():
     assert row['verdict'] == 'cannot tell' and row['cause'] == 'marker 3 has moved'
     assert row['tibia_poses'] == 5 and row['knee_flexion_range_deg'] == 30.0
     assert trial_row('walk', 'fail', [(Bodies, Given)])['verdict'] == 'fail'
+    Given.document['findings'].append({'sentence': 'it is mirrored', 'severity': 'error'})
+    row = trial_row('walk', 'pass', [(Bodies, Given)])
+    assert row['verdict'] == 'fail' and row['cause'] == 'marker 3 has moved; it is mirrored'
 
 
 def test_step_is_kept_only_with_its_digest_and_all_that_it_wrote(tmp_path):

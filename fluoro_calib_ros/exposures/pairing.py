@@ -212,8 +212,9 @@ class CompletePairer(_Counts):
     Frames are matched by number, or by stamp within the tolerance. The last `waiting` frames of
     each fluoroscope wait for their partners; a frame that is displaced from this queue counts as
     unpaired. A frame that arrives after one of its partners was displaced counts as late and as
-    unpaired. Exposures may become ready in another order than that of their frames. Raises
-    ValueError for an unknown pair_by.
+    unpaired. Exposures may become ready in another order than that of their frames. A stream that
+    restarts discards the waiting frames from before, so that they do not become partners of later
+    ones. Raises ValueError for an unknown pair_by.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
@@ -229,6 +230,11 @@ class CompletePairer(_Counts):
         name = frame.fluoroscope
         waiting = self._waiting[name]
         key = self._key(frame)
+        order = self._order(frame)
+        if order is Order.RESTART:
+            self._discard_before(frame)
+        if order is not Order.LATE:
+            self._latest[name] = frame
         if self._is_late(name, key):
             self._count_late(name)
             return ()
@@ -282,6 +288,20 @@ class CompletePairer(_Counts):
         if nearest is None or abs(nearest - key) > self._tolerance:
             return None
         return nearest
+
+    def _discard_before(self, frame: PairableFrame) -> None:
+        """Discard the frames from before a restart; the frame is the first one after it.
+
+        These are all frames of its stream, and those of others whose stamps are far from its own,
+        or not known. They count as unpaired.
+        """
+        for name, waiting in self._waiting.items():
+            for key, other in list(waiting.items()):
+                is_close = frame.stamp_ns and abs(other.stamp_ns - frame.stamp_ns) <= RESTART_NS
+                if name == frame.fluoroscope or not is_close:
+                    del waiting[key]
+                    self.unpaired[name] += 1
+        self._displaced = dict.fromkeys(self.fluoroscopes)
 
     def flush(self) -> Sequence[Exposure]:
         """Discard all waiting frames, which count as unpaired; return no exposures."""

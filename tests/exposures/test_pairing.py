@@ -259,6 +259,47 @@ def test_restarted_streams(count, later):
         )
 
 
+def trial(names, number, begin_ns, count=500, ahead=0, lost=()):
+    """Return the frames of a trial, row = 1000 trial + number; the last fluoroscope is ahead."""
+    of_each = {
+        name: [
+            Frame(name, n, begin_ns + n * 10 * MS, 1000 * number + n)
+            for n in range(1, count + 1)
+            if (name, n) not in lost
+        ]
+        for name in names
+    }
+    leading = of_each[names[-1]][:ahead]
+    rest = [f for name in names for f in of_each[name] if f not in leading]
+    return leading + sorted(rest, key=lambda f: f.number - ahead * (f.fluoroscope == names[-1]))
+
+
+@pytest.mark.parametrize(
+    ('names', 'skipped'), [('ab', ''), ('ab', 'a'), ('ab', 'b'), ('abc', ''), ('abc', 'b')]
+)
+@pytest.mark.parametrize('ahead', [0, 3])
+@pytest.mark.parametrize('count', [20, 500])
+def test_frames_left_from_one_trial_do_not_belong_to_the_next(names, ahead, count, skipped):
+    """Numbers begin at 1 in each trial; a frame is lost, or a fluoroscope misses a trial."""
+    pairer = exposure_pairer(names)
+    rows = []
+    for number in range(4):
+        lost = {('a', 10)} if number == 0 else set()
+        views = [name for name in names if number != 2 or name != skipped]
+        frames = trial(views, number, 10**12 + number * 60 * 10**9, count, ahead, lost)
+        rows += [row for row, _ in paired(pairer, frames, flush=False)]
+    trials = 3 if skipped and names == 'ab' else 4
+    assert trials * count - 1 - 3 * ahead <= len(rows) == len(set(rows)) <= trials * count
+
+
+def test_bursts_that_follow_each_other_quickly_are_kept_apart():
+    pairer = exposure_pairer('ab')
+    frames = []
+    for burst in range(3):
+        frames += trial('ab', burst, 10**12 + burst * 500 * MS, 20, lost={('a', 5)})
+    assert len(paired(pairer, frames, flush=False)) == 3 * 19
+
+
 def test_a_restarted_stream_releases_waiting_frames():
     pairer = exposure_pairer('abc')
     assert not paired(pairer, [frame('a', 500), frame('b', 500), frame('a', 501)], flush=False)

@@ -23,7 +23,7 @@ from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..options import option
 from .frame import Frame, Frames, cells_of
-from .pairing import CompletePairer, PairingOptions, RecordedPairing
+from .pairing import CompletePairer, PairingOptions, RecordedPairing, recorded_exposures
 
 MIN_COMMON_TARGETS = 8  # two frames with fewer common targets cannot be compared
 MAX_RECENT = 1000  # maximum number of remembered pairs
@@ -275,11 +275,8 @@ def collect_recorded(
     if mode == 'auto':
         mode = 'still' if any(_is_stream(f, still_options) for f in frames.values()) else 'all'
     collect = collector.offer if mode == 'still' else collector.add
-    recorded = [frame for view_frames in frames.values() for frame in view_frames]
-    for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
-        for pair in pairer.add(frame):
-            collect(pair)
-    pairer.flush()
+    for pair in recorded_exposures(pairer, frames.values()):
+        collect(pair)
     return collector.frames(), dict(pairer.unpaired)
 
 

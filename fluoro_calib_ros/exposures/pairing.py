@@ -13,9 +13,11 @@ limited time.
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Protocol
 
 from ..options import option, validate_options
@@ -131,6 +133,15 @@ def exposure_pairer(fluoroscopes: Iterable[str], options: PairingOptions | None 
     return PartialPairer(names, options)
 
 
+def recorded_exposures(
+    pairer: Pairer, frames: Iterable[Iterable[PairableFrame]]
+) -> Iterator[Exposure]:
+    """Pair recorded frames of several fluoroscopes in temporal order; yield the exposures."""
+    for frame in sorted(chain.from_iterable(frames), key=lambda f: (f.stamp_ns, f.number)):
+        yield from pairer.add(frame)
+    yield from pairer.flush()
+
+
 def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> str:
     """Return a sentence if recorded frames with the same number are far apart in time.
 
@@ -140,9 +151,7 @@ def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> 
         return ''
     pairer = CompletePairer(frames, RecordedPairing().unlimited())
     pairer.stamps = StampAgreement(pairer.fluoroscopes, recent=None)
-    recorded = [frame for view_frames in frames.values() for frame in view_frames]
-    for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
-        pairer.add(frame)
+    deque(recorded_exposures(pairer, frames.values()), maxlen=0)
     return pairer.stamps.disagreement()
 
 
@@ -222,6 +231,8 @@ class CompletePairer(_Counts):
         self._waiting: dict[str, OrderedDict[int, Any]] = {
             name: OrderedDict() for name in self.fluoroscopes
         }
+        # Stamps of these frames in ascending order, if they are paired by stamp.
+        self._stamps: dict[str, list[int]] = {name: [] for name in self.fluoroscopes}
         # Key of the last displaced frame.
         self._displaced: dict[str, int | None] = dict.fromkeys(self.fluoroscopes)
 
@@ -240,29 +251,34 @@ class CompletePairer(_Counts):
             return ()
         if key in waiting:
             self.unpaired[name] += 1  # the previous frame with the same key, which is replaced
+        elif not self._by_number:
+            insort(self._stamps[name], key)
         waiting[key] = frame
         exposure = self._complete(key)
         if exposure is not None:
             return (exposure,)
         while len(waiting) > self._max_waiting:
-            self._displaced[name], _ = waiting.popitem(last=False)
+            self._displaced[name] = next(iter(waiting))
+            self._take(name, next(iter(waiting)))
             self.unpaired[name] += 1
         return ()
 
+    def _take(self, name: str, key: int) -> Any:
+        """Remove and return a waiting frame."""
+        if not self._by_number:
+            stamps = self._stamps[name]
+            del stamps[bisect_left(stamps, key)]
+        return self._waiting[name].pop(key)
+
     def _complete(self, key: int) -> Exposure | None:
         """Remove and return the exposure with this key if all its frames are waiting."""
-        partners = {name: self._partner(name, key) for name in self.fluoroscopes}
-        exposure = {
-            name: self._waiting[name][partner]
-            for name, partner in partners.items()
-            if partner is not None
-        }
-        if len(exposure) < len(self.fluoroscopes):
-            return None
-        for name, partner in partners.items():
-            if partner is not None:
-                del self._waiting[name][partner]
-        return self._counted(exposure)
+        partners: dict[str, int] = {}
+        for name in self.fluoroscopes:
+            partner = self._partner(name, key)
+            if partner is None:
+                return None
+            partners[name] = partner
+        return self._counted({name: self._take(name, k) for name, k in partners.items()})
 
     def _is_late(self, fluoroscope: str, key: int) -> bool:
         """Return whether a partner of the frame with this key was already displaced.
@@ -281,13 +297,14 @@ class CompletePairer(_Counts):
 
     def _partner(self, name: str, key: int) -> int | None:
         """Return the key of the waiting frame of a fluoroscope that matches a key, or None."""
-        waiting = self._waiting[name]
         if self._by_number:
-            return key if key in waiting else None
-        nearest = min(waiting, key=lambda stamp: abs(stamp - key), default=None)
-        if nearest is None or abs(nearest - key) > self._tolerance:
-            return None
-        return nearest
+            return key if key in self._waiting[name] else None
+        stamps = self._stamps[name]
+        index = bisect_left(stamps, key)
+        close = [
+            t for t in stamps[max(index - 1, 0) : index + 1] if abs(t - key) <= self._tolerance
+        ]
+        return min(close, key=lambda stamp: abs(stamp - key), default=None)
 
     def _discard_before(self, frame: PairableFrame) -> None:
         """Discard the frames from before a restart; the frame is the first one after it.
@@ -299,7 +316,7 @@ class CompletePairer(_Counts):
             for key, other in list(waiting.items()):
                 is_close = frame.stamp_ns and abs(other.stamp_ns - frame.stamp_ns) <= RESTART_NS
                 if name == frame.fluoroscope or not is_close:
-                    del waiting[key]
+                    self._take(name, key)
                     self.unpaired[name] += 1
         self._displaced = dict.fromkeys(self.fluoroscopes)
 
@@ -308,6 +325,7 @@ class CompletePairer(_Counts):
         for name, waiting in self._waiting.items():
             self.unpaired[name] += len(waiting)
             waiting.clear()
+            self._stamps[name].clear()
         return ()
 
 

@@ -20,7 +20,7 @@ from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame, Frames, image_size_error, repeated_target_error
-from ..exposures.pairing import RecordedPairing, exposure_pairer
+from ..exposures.pairing import RecordedPairing, exposure_pairer, recorded_exposures
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from .intersection import IntersectedPoints, Intersector
@@ -309,9 +309,5 @@ def pair_recording(
                 f'there are no frames of fluoroscope {name}, only of {", ".join(frames)}'
             )
     pairer = exposure_pairer(names, pairing.unlimited())
-    ordered = sorted(
-        (frame for name in names for frame in frames[name]), key=lambda f: (f.stamp_ns, f.number)
-    )
-    exposures = [exposure for frame in ordered for exposure in pairer.add(frame)]
-    exposures += pairer.flush()
+    exposures = list(recorded_exposures(pairer, [frames[name] for name in names]))
     return exposures, dict(pairer.unpaired)

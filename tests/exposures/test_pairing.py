@@ -339,6 +339,32 @@ def test_repeated_and_unordered_frames_are_late(by):
     assert pairer.late == pairer.unpaired == {'a': 2, 'b': 1, 'c': 1}
 
 
+class CountedStamp(int):
+    """A stamp that counts how often stamps are subtracted or compared."""
+
+    count = 0
+
+    def __sub__(self, other):
+        CountedStamp.count += 1
+        return int(self) - int(other)
+
+    def __lt__(self, other):
+        CountedStamp.count += 1
+        return int(self) < int(other)
+
+
+@pytest.mark.parametrize('waiting', [100, 1600])
+def test_frames_that_wait_cost_no_time_for_each_further_frame(waiting):
+    """One fluoroscope of a recording was started earlier, so its frames have no partners."""
+    pairer = exposure_pairer('ab', RecordedPairing('stamp', 0.001).unlimited())
+    frames = [frame('a', row) for row in range(waiting)]
+    frames += [frame(name, row) for row in range(waiting, waiting + 200) for name in 'ab']
+    frames = [replace(f, stamp_ns=CountedStamp(f.stamp_ns)) for f in frames]
+    CountedStamp.count = 0
+    assert len(paired(pairer, frames)) == 200 and pairer.unpaired == {'a': waiting, 'b': 0}
+    assert CountedStamp.count < 60 * len(frames)
+
+
 def test_exposures_paired_by_stamp_are_numbered():
     """Frames within the tolerance of the earliest belong together, whatever their numbers."""
     pairer = exposure_pairer('abc', PairingOptions('stamp', 0.002))

@@ -94,6 +94,9 @@ class Kind(str, Enum):
     CORRECTED_ALREADY = 'corrected_already'
     POOR_CALIBRATION_FIT = 'poor_calibration_fit'
 
+    # Frames that are paired by stamp.
+    WIDE_TOLERANCE = 'wide_tolerance'
+
     # Orientation of the rig.
     NO_COMMON_TARGETS = 'no_common_targets'
     TARGETS_EXCHANGED = 'targets_exchanged'

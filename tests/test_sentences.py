@@ -48,6 +48,7 @@ from fluoro_calib_ros.estimation.start_orientation import UNTILTED
 from fluoro_calib_ros.exposures.collector import without_repeats
 from fluoro_calib_ros.exposures.frame import without_strays
 from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.exposures.stamps import StampTolerance
 from fluoro_calib_ros.findings import Finding, Kind, Place
 from fluoro_calib_ros.healing.diagnosis import Cause, Change
 from fluoro_calib_ros.images import detection, extraction, lattice, matching
@@ -254,6 +255,12 @@ def drift(source, confirmed, level=ERROR):
         ('a',), 0, 0.5, 0.05, np.array([1.0, 0.0]), 'start', source, confirmed, 0
     )
     return DriftWatch(SIZES)._drift_state(level, estimate, 9.0).finding
+
+
+def wide_tolerance():
+    tolerance = StampTolerance(2_000_000)
+    tolerance.interval_ns = 1_000_000
+    return tolerance.finding()
 
 
 def state(observations, learned):
@@ -536,6 +543,7 @@ MAKERS = {
         )[1].finding
     ),
     Kind.SHORT_RECORDING: lambda: RecordingDriftWatch(orientation(), SIZES).verdict().finding,
+    Kind.WIDE_TOLERANCE: wide_tolerance,
     Kind.WIDENED_BY_ALARM: lambda: widened(0.05, 0.6, miss_px=2.1, image_sd_px=0.0),
 }
 SENTENCES = {
@@ -905,6 +913,11 @@ SENTENCES = {
     Kind.SHORT_RECORDING: (
         'the recording is too short to detect a drift: it has # s, of which the first # s are '
         'the reference'
+    ),
+    Kind.WIDE_TOLERANCE: (
+        'stamps that differ by pair_tolerance, # ms, may belong to different exposures, as frames '
+        'are # ms apart; frames are paired if their stamps differ by less than half of that: set '
+        'pair_tolerance to less than half of the frame interval'
     ),
     Kind.WIDENED_BY_ALARM: (
         'rays miss each other by # px (RMS): until the rig is healed, the standard deviation of '

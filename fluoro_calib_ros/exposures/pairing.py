@@ -21,7 +21,14 @@ from itertools import chain
 from typing import Any, Protocol
 
 from ..options import option, validate_options
-from .stamps import RESTART_NS, Order, StampAgreement, StampedFrame, order_of
+from .stamps import (
+    RESTART_NS,
+    Order,
+    StampAgreement,
+    StampedFrame,
+    StampTolerance,
+    order_of,
+)
 
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # minimum number of views for an intersection
@@ -110,6 +117,7 @@ class Pairer(Protocol):
     incomplete: int  #: number of exposures without a frame of every fluoroscope
     silent: frozenset[str]  #: fluoroscopes that are no longer waited for
     stamps: StampAgreement  #: comparison of stamps of frames that were paired by number
+    tolerance: StampTolerance  #: tolerance of frames that are paired by stamp
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
         """Add a frame; return the exposures that are now ready."""
@@ -166,6 +174,7 @@ class _Counts:
         self.incomplete = 0
         self.silent: frozenset[str] = frozenset()
         self.stamps = StampAgreement(self.fluoroscopes)
+        self.tolerance = StampTolerance(options.tolerance_ns)
         # Latest frame of each stream.
         self._latest: dict[str, PairableFrame] = {}
         self._by_number = options.by_number
@@ -176,19 +185,26 @@ class _Counts:
         """Change the limits from now on. Raises ValueError if pair_by differs."""
         if options.by_number != self._by_number:
             raise ValueError('pair_by cannot change while frames are being paired')
-        self._tolerance = options.tolerance_ns
+        self.tolerance.largest_ns = options.tolerance_ns
         self._max_waiting = options.waiting
+
+    @property
+    def _reach(self) -> int:
+        """Largest difference between the keys of an exposure."""
+        return 0 if self._by_number else self.tolerance.ns
 
     def _key(self, frame: PairableFrame) -> int:
         """Return what the frames of an exposure have in common: number or stamp."""
         return frame.number if self._by_number else frame.stamp_ns
 
     def _order(self, frame: PairableFrame) -> Order:
-        """Return the place of a frame in its stream.
+        """Return the place of a frame in its stream, and note its stamp for the tolerance.
 
         A number that does not increase restarts the stream if time increases, or if the number
         decreases by more than frames can be out of order.
         """
+        if not self._by_number:
+            self.tolerance.add(frame.fluoroscope, frame.stamp_ns)
         latest = self._latest.get(frame.fluoroscope)
         if latest is None or self._key(frame) > self._key(latest):
             return Order.IN_ORDER
@@ -301,9 +317,7 @@ class CompletePairer(_Counts):
             return key if key in self._waiting[name] else None
         stamps = self._stamps[name]
         index = bisect_left(stamps, key)
-        close = [
-            t for t in stamps[max(index - 1, 0) : index + 1] if abs(t - key) <= self._tolerance
-        ]
+        close = [t for t in stamps[max(index - 1, 0) : index + 1] if abs(t - key) <= self._reach]
         return min(close, key=lambda stamp: abs(stamp - key), default=None)
 
     def _discard_before(self, frame: PairableFrame) -> None:
@@ -362,7 +376,6 @@ class PartialPairer(_Counts):
     def use(self, options: PairingOptions) -> None:
         """Change the limits from now on. Raises ValueError if pair_by differs."""
         super().use(options)
-        self._tolerance = 0 if self._by_number else options.tolerance_ns
         self._patience = options.patience
         self._recent = deque(self._recent.copy(), maxlen=self._patience)
 
@@ -402,7 +415,7 @@ class PartialPairer(_Counts):
             heads = {name: queue[0][0] for name, queue in queues.items() if queue}
             if len(heads) < MIN_VIEWS:
                 return ready
-            end = min(heads.values()) + self._tolerance
+            end = min(heads.values()) + self._reach
             names = [name for name, key in heads.items() if key <= end]
             missing_count = len(queues) - len(heads) - len(self.silent)
             if missing_count > 0 and not self._gives_up(heads, names):
@@ -437,7 +450,7 @@ class PartialPairer(_Counts):
             for name in self.fluoroscopes:
                 if name not in exposure:
                     self._passed[name] = end
-        self._recent.append(end - self._tolerance)
+        self._recent.append(end - self._reach)
         return [self._counted(exposure)]
 
     def flush(self) -> list[Exposure]:
@@ -445,7 +458,7 @@ class PartialPairer(_Counts):
         ready: list[Exposure] = []
         while any(self._queues.values()):
             first_key = min(queue[0][0] for queue in self._queues.values() if queue)
-            end = first_key + self._tolerance
+            end = first_key + self._reach
             names = [name for name, queue in self._queues.items() if queue and queue[0][0] <= end]
             ready += self._pop_exposure(names, end)
         self._start()

@@ -18,6 +18,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..findings import Finding, Kind, Severity
+
 NS_PER_S = 1_000_000_000
 # A stamp earlier than the latest one by more than this starts a new stream; else it is late.
 RESTART_NS = 1_000_000_000
@@ -26,6 +28,7 @@ RESTART_NS = 1_000_000_000
 MAX_LATE = 100
 RECENT = 200  # number of exposures that are compared
 MIN_EXPOSURES = 5
+RECENT_STEPS = 31  # number of steps between stamps that give the frame interval
 # Difference of stamps, as a fraction of the frame interval, from which another frame is nearer.
 MAX_PART = 0.5
 
@@ -144,19 +147,71 @@ def _frame_interval(number: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> f
     return float(np.median(times[forward] / numbers[forward]))
 
 
+class StampTolerance:
+    """Largest difference between the stamps of an exposure that is paired by stamp.
+
+    From half of the frame interval on, another frame may be nearer: after a lost frame, all later
+    ones would be paired with their neighbours. The tolerance is therefore kept below it. The
+    interval is the median of the last steps of a stream, the smallest of all streams.
+    """
+
+    def __init__(self, largest_ns: int) -> None:
+        self.largest_ns = largest_ns  #: tolerance that was asked for [ns]
+        self.interval_ns = 0  #: frame interval [ns], 0 if unknown
+        self._latest: dict[str, int] = {}
+        self._steps: dict[str, deque[int]] = {}
+
+    @property
+    def ns(self) -> int:
+        """Tolerance [ns]."""
+        half_ns = (self.interval_ns - 1) // 2
+        return min(self.largest_ns, half_ns) if self.interval_ns else self.largest_ns
+
+    def add(self, fluoroscope: str, stamp_ns: int) -> None:
+        """Add the stamp of a frame, 0 if unknown."""
+        latest_ns = self._latest.get(fluoroscope, 0)
+        order = order_of(stamp_ns, latest_ns)
+        if not stamp_ns or order is Order.LATE:
+            return
+        self._latest[fluoroscope] = stamp_ns
+        if latest_ns and order is Order.IN_ORDER:
+            steps = self._steps.setdefault(fluoroscope, deque(maxlen=RECENT_STEPS))
+            steps.append(stamp_ns - latest_ns)
+            medians = [
+                sorted(s)[len(s) // 2] for s in self._steps.values() if len(s) >= MIN_EXPOSURES
+            ]
+            self.interval_ns = min(medians, default=0)
+
+    def finding(self) -> Finding | None:
+        """Return a finding if the tolerance that was asked for is too large, else None."""
+        if self.ns == self.largest_ns:
+            return None
+        tolerance_ms, interval_ms = self.largest_ns * 1e-6, self.interval_ns * 1e-6
+        return Finding(
+            Kind.WIDE_TOLERANCE,
+            f'stamps that differ by pair_tolerance, {tolerance_ms:.3g} ms, may belong to '
+            f'different exposures, as frames are {interval_ms:.3g} ms apart; frames are paired if '
+            'their stamps differ by less than half of that',
+            advice='set pair_tolerance to less than half of the frame interval',
+            severity=Severity.WARNING,
+            numbers={'tolerance_ms': tolerance_ms, 'interval_ms': interval_ms},
+        )
+
+
 RECENT_IMAGES = 512  # number of exposures to which further images may be added
 
 
 class ExposureNumbers:
     """Assigns the same number to images of several fluoroscopes that belong to one exposure.
 
-    Images are matched by stamp, within the tolerance [ns]. Exposures are counted from 1 in the
-    order of their first image, so a lost image of any fluoroscope does not shift the numbers.
-    Images without a stamp (0) are counted for each fluoroscope separately.
+    Images are matched by stamp, within the tolerance [ns], which `StampTolerance` limits.
+    Exposures are counted from 1 in the order of their first image, so a lost image of any
+    fluoroscope does not shift the numbers. Images without a stamp (0) are counted for each
+    fluoroscope separately.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], tolerance_ns: int) -> None:
-        self._tolerance = tolerance_ns
+        self._tolerance = StampTolerance(tolerance_ns)
         # Stamp, number, and fluoroscopes whose image has arrived.
         self._recent: deque[tuple[int, int, set[str]]] = deque(maxlen=RECENT_IMAGES)
         self._last = 0
@@ -167,10 +222,12 @@ class ExposureNumbers:
         if not stamp_ns:
             self._without_stamp[fluoroscope] += 1
             return self._without_stamp[fluoroscope]
+        self._tolerance.add(fluoroscope, stamp_ns)
+        tolerance_ns = self._tolerance.ns
         nearest: tuple[int, int, set[str]] | None = None
         for exposure in self._recent:
             offset = abs(exposure[0] - stamp_ns)
-            if offset > self._tolerance or fluoroscope in exposure[2]:
+            if offset > tolerance_ns or fluoroscope in exposure[2]:
                 continue
             if nearest is None or offset <= abs(nearest[0] - stamp_ns):
                 nearest = exposure  # the newest of equally near ones, for repeated recordings

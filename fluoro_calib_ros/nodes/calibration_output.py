@@ -141,7 +141,7 @@ class FluoroscopeState(StreamState):
 
     progress: FluoroscopeProgress
     output: CalibrationOutput
-    disagreement: str  #: message if frames of the same number are far apart in time, else ''
+    disagreement: str  #: message if stamps show that pairs may be wrong, else ''
     angle: Health | None  #: warning if the angle of the C-arm is unknown
 
 
@@ -169,7 +169,7 @@ def never_published(state: FluoroscopeState) -> Health | None:
 
 
 def distant_stamps(state: FluoroscopeState) -> Health | None:
-    """Warn if frames of the same number are far apart in time."""
+    """Warn if stamps show that pairs may be wrong."""
     return warning(state.disagreement)
 
 

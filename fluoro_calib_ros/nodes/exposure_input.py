@@ -157,9 +157,13 @@ class ExposureInput:
             )
 
     def disagreement(self) -> str:
-        """Return a message if frames with the same number are far apart in time, else ''."""
+        """Return a message if stamps show that pairs may be wrong, else ''.
+
+        Frames with the same number are far apart in time, or stamps fit two exposures.
+        """
         with self._lock:
-            return self._pairer.stamps.disagreement()
+            finding = self._pairer.tolerance.finding()
+            return finding.sentence if finding else self._pairer.stamps.disagreement()
 
     def capture(self) -> Future:
         """Collect the next pair, whatever the mode.

@@ -260,8 +260,9 @@ foreign_calibrations = counted(
 
 
 def distant_stamps(state: ReconstructionState) -> Health | None:
-    """Warn if frames of the same number are far apart in time."""
-    return warning(state.pairer.stamps.disagreement())
+    """Warn if frames of the same number are far apart in time, or stamps fit two exposures."""
+    finding = state.pairer.tolerance.finding()
+    return warning(finding.sentence if finding else state.pairer.stamps.disagreement())
 
 
 # Exposures lacked some of the views.

@@ -15,7 +15,8 @@ from fluoro_calib_ros.exposures.pairing import (
     RecordedPairing,
     exposure_pairer,
 )
-from fluoro_calib_ros.exposures.stamps import Order, order_of
+from fluoro_calib_ros.exposures.stamps import Order, StampTolerance, order_of
+from fluoro_calib_ros.findings import Kind
 
 MS = 1_000_000
 BY = ('frame_number', 'stamp')
@@ -337,6 +338,48 @@ def test_repeated_and_unordered_frames_are_late(by):
     ]
     assert paired(pairer, frames) == [(5, {'a', 'b', 'c'})]
     assert pairer.late == pairer.unpaired == {'a': 2, 'b': 1, 'c': 1}
+
+
+@pytest.mark.parametrize('names', ['ab', 'abc'])
+def test_a_lost_frame_does_not_shift_later_ones_if_the_tolerance_is_too_large(names):
+    """At 1000 Hz the default tolerance of 2 ms covers two frame intervals."""
+    pairer = exposure_pairer(names, PairingOptions('stamp'))
+    frames = [
+        Frame(name, row, 10**9 + row * MS, row)
+        for row in range(500)
+        for name in reversed(names)
+        if (name, row) != (names[-1], 100)
+    ]
+    assert len(paired(pairer, frames, flush=False)) == 499 + (names == 'abc')
+
+
+@pytest.mark.parametrize(
+    ('tolerance_ms', 'used_ns'), [(0.4, 400_000), (0.5, 499_999), (20, 499_999)]
+)
+def test_tolerance_is_kept_below_half_of_the_frame_interval(tolerance_ms, used_ns):
+    """The interval is that of the fastest stream; lost, repeated and late frames do not count."""
+    tolerance = StampTolerance(round(tolerance_ms * MS))
+    assert tolerance.finding() is None
+    for row in range(50):
+        tolerance.add('slow', 10**9 + row * 10 * MS)
+        for shift in (0, 0, -2):
+            if row % 4:
+                tolerance.add('fast', 10**9 + (row + shift) * MS)
+        tolerance.add('without stamps', 0)
+    assert tolerance.ns == used_ns
+    found = tolerance.finding()
+    if tolerance_ms < 0.5:
+        assert found is None
+    else:
+        assert found.kind is Kind.WIDE_TOLERANCE
+        assert found.numbers == pytest.approx({'tolerance_ms': tolerance_ms, 'interval_ms': 1.0})
+
+
+def test_single_shots_and_restarts_leave_the_tolerance_as_it_is():
+    tolerance = StampTolerance(2 * MS)
+    for stamp_ns in (10**9, 10**9 + MS, 1, 2, 10**10, 10**10 + MS):
+        tolerance.add('a', stamp_ns)
+    assert tolerance.ns == 2 * MS and tolerance.finding() is None
 
 
 class CountedStamp(int):

@@ -10,6 +10,8 @@ from types import SimpleNamespace
 import pytest
 from fluoro_calib_msgs.srv import Reset
 
+from fluoro_calib_ros.exposures.pairing import PairingOptions, exposure_pairer
+from fluoro_calib_ros.exposures.stamps import StampTolerance
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.nodes import calibration_output, correcting_node, image_stream
 from fluoro_calib_ros.nodes import reconstruction_output as reconstruction
@@ -83,6 +85,7 @@ def reconstruction_state(stalled, **changes):
         'rigs': SimpleNamespace(newest='a rig'),
         'pairer': SimpleNamespace(
             stamps=SimpleNamespace(disagreement=lambda: ''),
+            tolerance=StampTolerance(1),
             silent=frozenset(),
         ),
         'misses': SimpleNamespace(finding=lambda: None),
@@ -101,6 +104,17 @@ def test_stopped_streams_stand_before_what_else_is_wrong():
     both = reconstruction_state([('a', 'no frame for 2 s'), ('b', '')], misses=wrong)
     found = health_of(both, reconstruction.CONDITIONS)
     assert found == (ERROR, 'a: no frame for 2 s; the rays miss each other')
+
+
+def test_stamps_that_fit_two_exposures_are_a_warning():
+    pairer = exposure_pairer('ab', PairingOptions('stamp', tolerance_s=0.002))
+    state = reconstruction_state([('a', '')], pairer=pairer)
+    assert health_of(state, reconstruction.CONDITIONS).level == OK
+    for stamp_ns in range(10**9, 10**9 + 10**7, 10**6):
+        pairer.tolerance.add('a', stamp_ns)
+    assert health_of(state, reconstruction.CONDITIONS).level == WARN
+    pairer.use(PairingOptions('stamp', tolerance_s=0.0004))
+    assert health_of(state, reconstruction.CONDITIONS).level == OK
 
 
 def test_messages_lost_at_the_input_are_told_before_the_partners_that_they_leave_alone():

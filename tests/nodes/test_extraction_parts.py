@@ -27,6 +27,15 @@ def test_images_of_an_exposure_have_the_same_number_whatever_is_lost():
     assert found == [('a', 1), ('b', 1), ('a', 2), ('a', 3), ('b', 3), ('b', 4), ('a', 4)]
 
 
+def test_a_lost_image_shifts_no_numbers_if_the_tolerance_is_too_large():
+    numbers = ExposureNumbers('ab', 2 * MS)
+    found = [
+        [numbers.number(name, 10**18 + row * MS) for name in 'ab' if (name, row) != ('a', 50)]
+        for row in range(100)
+    ]
+    assert found == [[row + 1] * (1 if row == 50 else 2) for row in range(100)]
+
+
 def test_a_repeated_recording_is_numbered_on():
     numbers = ExposureNumbers('ab', MS)
     found = [numbers.number(name, 5 * MS * i) for _ in range(2) for i in (1, 2) for name in 'ab']

@@ -123,7 +123,9 @@ class ExposureInput:
         """Discard all exposures and return their number. The counts of frames are kept."""
         with self._lock:
             count = len(self._collector.exposures)
+            unpaired = self._pairer.unpaired
             self._start()
+            self._pairer.unpaired = unpaired
             for stream in self.streams.values():
                 stream.image_size = None
             return count

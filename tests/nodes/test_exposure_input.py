@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Exposures collected from the streams of a calibration node, without its graph."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rigs
+
+from fluoro_calib_ros.exposures.collector import StillOptions
+from fluoro_calib_ros.exposures.pairing import PairingOptions
+from fluoro_calib_ros.nodes.exposure_input import ExposureInput
+from fluoro_calib_ros.nodes.messages.observations import ObservedFrame
+
+
+class Lines:
+    """A logger that keeps its lines."""
+
+    def __init__(self):
+        self.lines = []
+
+    def info(self, text):
+        self.lines.append(text)
+
+    warning = info
+
+
+@pytest.fixture
+def logger():
+    return Lines()
+
+
+@pytest.fixture
+def exposures(logger):
+    settings = SimpleNamespace(
+        pairing=PairingOptions(),
+        still=StillOptions(),
+        node=SimpleNamespace(collect='still'),
+        limits=SimpleNamespace(max_exposures=100),
+    )
+    phantom = rigs.rig().phantom
+    return ExposureInput('ab', phantom, settings, lambda pair: None, lambda: None, logger)
+
+
+def observed(name, number, stamp_s):
+    """Return an exposure of the rig as a message; its number is that of the pose."""
+    frame = rigs.exposures()[name][number - 1]
+    return ObservedFrame(
+        stamp_s,
+        0,
+        f'{name}_optical',
+        number,
+        frame.image_size,
+        np.asarray(frame.target_id, np.uint32).tobytes(),
+        *frame.uv.T,
+        sigma=np.full(len(frame.uv), 0.1),
+        start=b'',
+    )
+
+
+def test_counts_of_frames_are_kept_by_a_reset(exposures):
+    for number in (1, 2, 3):
+        for name in 'ab' if number == 2 else 'a':
+            exposures.add(name, observed(name, number, number))
+    exposures.add('a', observed('a', 1, 100))  # the stream restarts
+    before = exposures.collected('a')
+    assert (before.received, before.unpaired, before.exposures) == (4, 2, 1)
+    assert exposures.reset() == 1
+    after = exposures.collected('a')
+    assert (after.received, after.unpaired, after.exposures) == (4, 2, 0)

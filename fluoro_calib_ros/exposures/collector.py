@@ -31,6 +31,7 @@ MAX_RECENT_RADIOGRAPHS = 32  # maximum per fluoroscope, while their frames are p
 MAX_GAP = 10  # longest gap in a stream, as a multiple of the still time
 
 COLLECT_MODES = ('auto', 'all', 'still')  # modes for recordings
+NO_STAMP = 'frames without a stamp do not show for how long the phantom stands still'
 
 Pair = Mapping[str, Frame]
 
@@ -100,9 +101,12 @@ class ExposureCollector:
 
         Returns '' if the pair was collected, otherwise the reason. The first frame of a stream is
         collected like a single shot, and discarded if the next ones show that the phantom moves.
+        Pairs without a stamp are not collected.
         """
         first_name = self.fluoroscopes[0]
         stamp_ns = pair[first_name].stamp_ns
+        if not stamp_ns:
+            return NO_STAMP
         still_ns = self.still.still_time_s * 1e9
         self._confirm_single(pair, still_ns)
         window = [p for p in self._recent if 0 <= stamp_ns - p[first_name].stamp_ns <= still_ns]
@@ -268,7 +272,15 @@ def collect_recorded(
         Collected frames by fluoroscope.
     unpaired : dict of str to int
         Number of frames without a partner, by fluoroscope.
+
+    Raises
+    ------
+    DataError
+        For the mode 'still', if no frame has a stamp.
     """
+    recorded = [frame for view_frames in frames.values() for frame in view_frames]
+    if mode == 'still' and recorded and not any(frame.stamp_ns for frame in recorded):
+        raise DataError(f'{NO_STAMP}: collect all')
     still_options = StillOptions()
     pairer = CompletePairer(frames, RecordedPairing(pair_by, tolerance_s).unlimited())
     collector = ExposureCollector(frames, still_options)

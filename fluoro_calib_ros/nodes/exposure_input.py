@@ -263,6 +263,11 @@ class ExposureInput:
         elif self._settings.node.collect == 'still':
             before = len(collector.exposures)
             refusal = collector.offer(pair)
+            first = pair[self._names[0]]
+            if not first.stamp_ns:
+                self.streams[first.fluoroscope].refusals.note(
+                    f'fluoroscope {first.fluoroscope}: {refusal}; use the service capture'
+                )
             if len(collector.exposures) < before:
                 self._logger.info(
                     f'exposure {before} discarded: it is the first frame of a stream in which the '

@@ -33,6 +33,7 @@ def frame(name='a', number=1, stamp_ms=0.0, shift=0.0, ids=range(20)):
 
 
 def pair(number=1, stamp_ms=0.0, shift=0.0, shift_b=None):
+    stamp_ms += 1000  # 0 is an unknown time
     return {
         'a': frame('a', number, stamp_ms, shift),
         'b': frame('b', number, stamp_ms, shift if shift_b is None else shift_b),
@@ -213,6 +214,14 @@ def test_add_requires_only_a_new_number():
     assert [e['b'].number for e in collector.exposures] == [1, 2]
 
 
+def test_pairs_without_a_stamp_are_collected_only_on_request():
+    collector = ExposureCollector('ab')
+    reasons = {collector.offer(pair(number, -1000, 50 * number)) for number in range(1, 5)}
+    assert collector.exposures == [] and len(reasons) == 1 and '' not in reasons
+    assert collector.add(pair(5, -1000)) == '' and collector.offer(pair(6, 0, 50)) == ''
+    assert [p['a'].number for p in collector.exposures] == [5, 6]
+
+
 def test_reset_discards_everything():
     collector = ExposureCollector('ab')
     collector.offer(pair(1, 0, 0))
@@ -277,10 +286,18 @@ def test_unpaired_frames_are_left_out_and_counted():
 def test_two_frames_are_exposures_unless_they_are_a_stream(gap_ms, count):
     """Nobody moves a phantom to another pose within the time for which it has to be still."""
     frames = {
-        name: [frame(name, 1 + i, i * gap_ms, shift=50.0 * i) for i in range(2)] for name in 'ab'
+        name: [frame(name, 1 + i, (1 + i) * gap_ms, shift=50.0 * i) for i in range(2)]
+        for name in 'ab'
     }
     kept, _ = collect_recorded(frames)
     assert [len(kept[name]) for name in 'ab'] == [count, count]
+
+
+def test_recording_without_stamps_has_no_still_exposures():
+    recorded = recording([0, 50, 100], 0.0)
+    assert len(collect_recorded(recorded)[0]['a']) == 3
+    with pytest.raises(DataError, match='without a stamp'):
+        collect_recorded(recorded, 'still')
 
 
 def test_empty_recording():

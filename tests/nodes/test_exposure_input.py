@@ -70,3 +70,18 @@ def test_counts_of_frames_are_kept_by_a_reset(exposures):
     assert exposures.reset() == 1
     after = exposures.collected('a')
     assert (after.received, after.unpaired, after.exposures) == (4, 2, 0)
+
+
+def test_frames_without_a_stamp_are_collected_only_by_a_capture_and_the_log_says_so(
+    exposures, logger
+):
+    for number in range(1, 4):
+        for name in 'ab':
+            exposures.add(name, observed(name, number, 0))
+    assert exposures.collected('a').exposures == 0
+    assert 'without a stamp' in exposures.streams['a'].refusals.last_fault
+    assert 'use the service capture' in logger.lines[0]
+    captured = exposures.capture()
+    for name in 'ab':
+        exposures.add(name, observed(name, 15, 0))
+    assert captured.result() == (15, 1)

@@ -160,6 +160,7 @@ class StampTolerance:
         self.interval_ns = 0  #: frame interval [ns], 0 if unknown
         self._latest: dict[str, int] = {}
         self._steps: dict[str, deque[int]] = {}
+        self._intervals: dict[str, int] = {}
 
     @property
     def ns(self) -> int:
@@ -177,10 +178,9 @@ class StampTolerance:
         if latest_ns and order is Order.IN_ORDER:
             steps = self._steps.setdefault(fluoroscope, deque(maxlen=RECENT_STEPS))
             steps.append(stamp_ns - latest_ns)
-            medians = [
-                sorted(s)[len(s) // 2] for s in self._steps.values() if len(s) >= MIN_EXPOSURES
-            ]
-            self.interval_ns = min(medians, default=0)
+            if len(steps) >= MIN_EXPOSURES:
+                self._intervals[fluoroscope] = sorted(steps)[len(steps) // 2]
+                self.interval_ns = min(self._intervals.values())
 
     def finding(self) -> Finding | None:
         """Return a finding if the tolerance that was asked for is too large, else None."""

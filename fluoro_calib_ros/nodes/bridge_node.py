@@ -109,13 +109,24 @@ class Gate:
         self._on_refused = on_refused
         self._clients: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
-        server = self._loop.run_until_complete(asyncio.start_server(self._serve, host, port))
-        self.port: int = server.sockets[0].getsockname()[1]
-        threading.Thread(target=self._loop.run_forever, name='gate', daemon=True).start()
+        self._server = self._loop.run_until_complete(asyncio.start_server(self._serve, host, port))
+        self.port: int = self._server.sockets[0].getsockname()[1]
+        self._thread = threading.Thread(target=self._loop.run_forever, name='gate', daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
-        """Stop letting clients through."""
+        """Stop listening, and end all connections."""
+        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _end(self) -> None:
+        self._server.close()
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Check the request of a client, then forward data in both directions."""
@@ -125,6 +136,9 @@ class Gate:
         try:
             with suppress(*CLIENT_ERRORS):
                 await self._admit(reader, writer)
+        except asyncio.CancelledError:
+            writer.transport.abort()  # close() would wait for a client that does not read
+            raise
         finally:
             self._clients.discard(task)
             writer.close()

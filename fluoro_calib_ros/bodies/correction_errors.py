@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 # The errors of a correction at two pixels are correlated by exp(-distance / REACH). Unit: longer
 # side of the image, as measured by benchmarks/reach.py.
 REACH = 0.15
+SAMPLE = 100  # number of exposures that suffice to locate a marker
 
 
 def covariance_of_means(uv: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -21,13 +22,17 @@ def covariance_of_means(uv: NDArray[np.float64]) -> NDArray[np.float64]:
     The covariance is the mean correlation of the errors of two markers in any two exposures; it is
     0 for a marker that is not seen.
     """
-    # 100 evenly spread exposures of a recording suffice to locate its markers.
-    rows = np.unique(np.linspace(0, len(uv) - 1, 100).astype(int))
     out = []
-    for path in np.moveaxis(uv[rows], 2, 0):
-        seen = np.isfinite(path).all(axis=2)
-        share = seen / np.maximum(seen.sum(axis=0), 1)
-        flat = np.where(seen[..., None], path, 0.0).reshape(-1, 2)
-        correlation = np.exp(-cdist(flat, flat) / REACH).reshape(*seen.shape, *seen.shape)
-        out.append(np.einsum('tk,tksl,sl->kl', share, correlation, share, optimize=True))
+    for path in np.moveaxis(uv, (2, 1), (0, 1)):
+        samples = [_sample(track[np.isfinite(track).all(axis=1)]) for track in path]
+        points = np.concatenate(samples)
+        counts = np.array([len(sample) for sample in samples])
+        marker = np.repeat(np.arange(len(counts)), counts)
+        share = (marker == np.arange(len(counts))[:, None]) / np.maximum(counts, 1)[:, None]
+        out.append(share @ np.exp(-cdist(points, points) / REACH) @ share.T)
     return np.array(out)
+
+
+def _sample(track: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return up to SAMPLE evenly spread image points (n, 2) of a marker that is seen."""
+    return track[np.linspace(0, len(track) - 1, min(len(track), SAMPLE)).astype(int)]

@@ -54,6 +54,17 @@ def test_errors_of_a_marker_that_stands_still_stay_and_those_of_one_that_moves_f
     assert not covariance_of_means(np.full((30, 1, 2, 2), np.nan)).any()
 
 
+def test_marker_that_a_few_exposures_of_a_long_recording_show_has_an_error():
+    """It stands still in 80 of 10,000 exposures, so its error is constant."""
+    uv = np.full((10_000, 3, 1, 2), 0.5)
+    uv[:, 2] = np.nan
+    uv[5060:5140, 2] = 0.5 + 0.2 * REACH
+    (claimed,) = covariance_of_means(uv)
+    shared = np.exp(-0.2 * np.sqrt(2))
+    expected = [[1, 1, shared], [1, 1, shared], [shared, shared, 1]]
+    np.testing.assert_allclose(claimed, expected)
+
+
 def test_learned_shapes_scatter_as_claimed_where_corrections_have_errors():
     """Views along x and y see a moving body; the image points have the errors of a field."""
     rng = np.random.default_rng(3)

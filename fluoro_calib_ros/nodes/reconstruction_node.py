@@ -310,14 +310,12 @@ class ReconstructionNode(StreamNode):
             target_id=intersected.target_id,
             points=intersected.points,
         )
-        self._output.publish(content)
+        settings = self._settings
+        self._output.publish(content, settings.ellipsoid_sigmas, settings.ellipsoid_rate)
         self._retractions.note({n: view.stamp_ns for n, view in exposure.items()}, content)
         self._reconstructed += 1
         self._points.add(intersected.points)
         self._misses.add(intersected.points)
-        self._output.publish_forms(
-            content, self._settings.ellipsoid_sigmas, self._settings.ellipsoid_rate
-        )
         if self._follower is not None:
             number = first_view.frame.frame_number
             widened_rig = rig._replace(intersector=intersector)

@@ -116,12 +116,13 @@ class PointsOutput:
         }
         self._markers_published_ns = 0
 
-    def publish(self, content: PointsContent) -> None:
-        """Publish points with their covariance."""
-        self._outputs['points_with_covariance'].publish(encode_reconstructed_points(content))
+    def publish(self, content: PointsContent, sigmas: float, rate_hz: float) -> None:
+        """Publish points with their covariance, then the other forms that have subscribers.
 
-    def publish_forms(self, content: PointsContent, sigmas: float, rate_hz: float) -> None:
-        """Publish the other forms that have subscribers; sigmas: half axes of the ellipsoids."""
+        sigmas: half axes of the ellipsoids. rate_hz: largest rate of the ellipsoids.
+        """
+        data = encode_reconstructed_points(content)
+        self._outputs['points_with_covariance'].publish(data)
         subscribed = [
             name
             for name in POINT_FORMS
@@ -129,7 +130,6 @@ class PointsOutput:
         ]
         if not subscribed:
             return
-        data = encode_reconstructed_points(content)
         message = deserialize_message(data, ReconstructedPoints)
         good = np.flatnonzero(content.points.status <= OUTSIDE)
         if 'points' in subscribed:

@@ -15,6 +15,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 from fluoro_calib_ros.io.bags.metadata import from_cdr, typestore
+from fluoro_calib_ros.nodes import reconstruction_output
 from fluoro_calib_ros.nodes.messages.observations import (
     decode_corrected_observations,
     decode_target_observations,
@@ -199,6 +200,28 @@ def test_points_are_written_as_rclpy_reads_them(n, frame_id, ids):
     found = deserialize_message(encode_reconstructed_points(content), ReconstructedPoints)
     assert found == expected and list(found.rays) == content.points.rays.tolist()
     assert deserialize_message(serialize_message(expected), ReconstructedPoints) == found
+
+
+def test_points_are_encoded_once_for_all_forms(monkeypatch):
+    encoded, published = [], {}
+
+    def encode(content):
+        encoded.append(content)
+        return encode_reconstructed_points(content)
+
+    def create_output(kind, topic, qos):
+        return SimpleNamespace(
+            publish=lambda message: published.setdefault(topic.rpartition('/')[2], message),
+            get_subscription_count=lambda: 1,
+        )
+
+    monkeypatch.setattr(reconstruction_output, 'encode_reconstructed_points', encode)
+    content = points_content(5, 'rig', ('a-1', 'b-2'))
+    output = reconstruction_output.PointsOutput(SimpleNamespace(create_output=create_output))
+    output.publish(content, sigmas=10.0, rate_hz=30.0)
+    assert len(encoded) == 1 and {'points_with_covariance', 'points', 'markers'} <= set(published)
+    good = np.count_nonzero(content.points.status <= 1)
+    assert published['points'].width == good > 0
 
 
 READERS = [

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
 from fluoro_calib_msgs.action import Heal
 from fluoro_calib_msgs.msg import CorrectedObservations, DriftStatus, RigOrientation
 from fluoro_calib_msgs.srv import Reset
@@ -25,7 +24,6 @@ from ..exposures.stamps import nanoseconds_from_stamp
 from ..limits import StreamLimits
 from ..options import option
 from ..reconstruction.epipolar import RecentMisses
-from ..reconstruction.intersection import OUTSIDE
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
@@ -42,7 +40,7 @@ from .reconstruction_output import (
     statuses_of,
 )
 from .retractions import BodyRetractions, PointRetractions
-from .rig_input import BodyFollower, BodyParameters, Rig, RigInput, read_body_files
+from .rig_input import BodyFollower, BodyParameters, RigInput, read_body_files
 from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
 from .runtime.lifecycle import Stream, StreamNode, stream_faults
 from .runtime.main import run
@@ -243,6 +241,15 @@ class ReconstructionNode(StreamNode):
                 max_bytes=self._limits.max_bytes,
             )
 
+    def deactivate(self) -> None:
+        """Stop the stream readers, and publish the exposures that wait for a further view."""
+        super().deactivate()
+        for exposure in self._pairer.flush():
+            try:
+                self._reconstruct(exposure)
+            except Exception as error:  # only this exposure is lost
+                self._refusals.fail(VIEWS, error)
+
     # -- the rig
 
     def _on_orientation(self, message: RigOrientation) -> None:
@@ -284,16 +291,16 @@ class ReconstructionNode(StreamNode):
             return
         stamp_ns = nanoseconds_from_stamp(frame)
         for exposure in self._pairer.add(_View(name, frame.frame_number, stamp_ns, frame)):
-            self._exposures += 1
-            rig = self._rigs.rig_of({n: v.frame.calibration_id for n, v in exposure.items()})
-            if rig is None:
-                self._without_orientation += 1
-                continue
-            self._reconstruct(rig, exposure)
-            self._latencies.add(time.time_ns() - info['received_timestamp'])
+            if self._reconstruct(exposure):
+                self._latencies.add(time.time_ns() - info['received_timestamp'])
 
-    def _reconstruct(self, rig: Rig, exposure: Mapping[str, _View]) -> None:
-        """Intersect the views of an exposure, publish the points, then bodies and joints."""
+    def _reconstruct(self, exposure: Mapping[str, _View]) -> bool:
+        """Publish the points, then bodies and joints; return False without an orientation."""
+        self._exposures += 1
+        rig = self._rigs.rig_of({n: view.frame.calibration_id for n, view in exposure.items()})
+        if rig is None:
+            self._without_orientation += 1
+            return False
         views = [
             _corrected_view(exposure[name].frame) if name in exposure else None
             for name in self._names
@@ -317,15 +324,14 @@ class ReconstructionNode(StreamNode):
         self._points.add(intersected.points)
         self._misses.add(intersected.points)
         if self._follower is not None:
-            number = first_view.frame.frame_number
-            widened_rig = rig._replace(intersector=intersector)
-            for bodies in self._follower.add(
-                intersected, widened_rig, number, first_view.stamp_ns
-            ):
+            widened = rig._replace(intersector=intersector)
+            number = content.frame_number
+            for bodies in self._follower.add(intersected, widened, number, content.stamp_ns):
                 self._bodies_output.publish(bodies)
                 self._retractions.bodies.note(bodies)
         if rig.watch is not None:
             watch_exposure(rig.watch, first_view.stamp_ns, intersected)
+        return True
 
     # -- diagnostics
 
@@ -381,13 +387,8 @@ class ReconstructionNode(StreamNode):
 
 def _corrected_view(frame: CorrectedFrame) -> CorrectedView:
     """Return the CorrectedView of a frame."""
-    return CorrectedView(
-        frame.target_id,
-        np.array([frame.u, frame.v]).T,
-        frame.sigma,
-        frame.correction_sd,
-        frame.status == OUTSIDE,
-    )
+    columns = frame.u, frame.v, frame.sigma, frame.correction_sd, frame.status
+    return CorrectedView.of_columns(frame.target_id, columns)
 
 
 main = partial(run, ReconstructionNode)

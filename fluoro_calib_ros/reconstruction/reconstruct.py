@@ -39,6 +39,15 @@ class CorrectedView:
     correction_sd: NDArray[np.float64]
     outside: NDArray[np.bool_]  #: (n,) True beyond the calibrated area
 
+    @classmethod
+    def of_columns(
+        cls, target_id: NDArray[np.integer], columns: Sequence[NDArray[Any]]
+    ) -> CorrectedView:
+        """Return the view of columns (n,): u, v, sigma, correction_sd [px] and status."""
+        u, v, sigma, correction_sd, status = columns
+        outside = status == int(CorrectionStatus.OUTSIDE)
+        return cls(target_id, np.array([u, v]).T, sigma, correction_sd, outside)
+
 
 @dataclass(frozen=True)
 class MatchedViews:
@@ -224,13 +233,8 @@ def corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> Correct
     error = error or repeated_target_error(frame.target_id)
     if error:
         raise DataError(f'{label}: {error}')
-    u, v, sigma, correction_sd, status = calibration.correct_arrays(
-        frame.uv[:, 0], frame.uv[:, 1], frame.sigma, frame.angle
-    )
-    uv = np.stack([u, v], axis=1)
-    return CorrectedView(
-        frame.target_id, uv, sigma, correction_sd, status == CorrectionStatus.OUTSIDE
-    )
+    columns = calibration.correct_arrays(frame.uv[:, 0], frame.uv[:, 1], frame.sigma, frame.angle)
+    return CorrectedView.of_columns(frame.target_id, columns)
 
 
 def reconstruct_recording(

@@ -4,9 +4,12 @@
 """The lifecycle of the streaming nodes, their parameters, and two rigs at the same time."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
+import rigs
 from builtin_interfaces.msg import Time
+from fluoro_calib_msgs.msg import CorrectedObservations
 from fluoro_calib_msgs.srv import Capture
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -15,10 +18,14 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from ros_graph import NAMES, Graph, value_of
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
 
+from fluoro_calib_ros.io.calibration import save_orientation
 from fluoro_calib_ros.nodes.correction_node import CorrectionNode
 from fluoro_calib_ros.nodes.image_node import ImageNode
 from fluoro_calib_ros.nodes.reconstruction_node import ReconstructionNode
+from fluoro_calib_ros.nodes.runtime.topics import observations_qos
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 NODES = ('correction_node', 'reconstruction_node', 'image_node')
 
@@ -175,6 +182,51 @@ def test_failed_transition_gives_the_reason_and_changes_nothing(graph):
         assert state(client, 'correction_node') == State.PRIMARY_STATE_INACTIVE
     assert node.log.count('Unexpected QoS override for policy `reliability`: `luck`') == 2
     assert node.end() == 0 and 'Traceback' not in node.log
+
+
+def test_deactivated_node_publishes_exposures_that_wait_for_a_view(graph):
+    """The third fluoroscope is silent, so that it is waited for."""
+    client = graph.client
+    ids = {name: SimpleNamespace(calibration_id=f'{name}-1') for name in 'abc'}
+    orientation = rigs.true_orientation(virtual_rig(1, names=tuple(ids)).fluoroscopes, ids)
+    path = save_orientation(graph.directory, orientation)
+    points = client.listen('reconstruction/points_with_covariance')
+    outputs = [
+        client.create_publisher(
+            CorrectedObservations, f'{name}/corrected_observations', observations_qos()
+        )
+        for name in 'ab'
+    ]
+    expect(client, 'reconstruction_node')
+    graph.start('reconstruction_node', {'fluoroscopes': '[a, b, c]', 'orientation_file': path})
+    client.wait_until(lambda: all(out.get_subscription_count() for out in outputs))
+    for number in range(1, 6):
+        for output, calibration_id in zip(outputs, orientation.calibration_ids):
+            output.publish(corrected(number, calibration_id))
+    status = client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: all(value_of(s, f'frames received of {name}') == '5' for name in 'ab'),
+        'reconstruction',
+    )
+    assert value_of(status, 'exposures') == '0' and not points
+    assert change(client, 'reconstruction_node', Transition.TRANSITION_DEACTIVATE)
+    client.wait_until(lambda: len(points) == 5, what='the points')
+    assert [message.frame_number for message in points] == [1, 2, 3, 4, 5]
+
+
+def corrected(number, calibration_id):
+    """Return a message with one target in the middle of the image."""
+    return CorrectedObservations(
+        header=Header(stamp=Time(sec=number)),
+        frame_number=number,
+        calibration_id=calibration_id,
+        target_id=[7],
+        u=[512.0],
+        v=[512.0],
+        sigma=[0.3],
+        correction_sd=[0.1],
+        status=bytes(1),
+    )
 
 
 @pytest.mark.parametrize('kind', [CorrectionNode, ImageNode, ReconstructionNode])

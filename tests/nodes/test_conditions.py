@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from fluoro_calib_msgs.srv import Reset
+from rclpy.task import Future
 
 from fluoro_calib_ros.exposures.pairing import PairingOptions, exposure_pairer
 from fluoro_calib_ros.exposures.stamps import StampTolerance
@@ -27,7 +28,7 @@ from fluoro_calib_ros.nodes.runtime.diagnostics import (
     health_of,
 )
 from fluoro_calib_ros.nodes.runtime.lifecycle import Stream, stream_faults
-from fluoro_calib_ros.nodes.runtime.services import Requests, ServiceEntry, create_services
+from fluoro_calib_ros.nodes.runtime.services import Requests, ServiceEntry, create_services, within
 
 LOGGER = SimpleNamespace(warning=lambda text: None, error=lambda text: None)
 
@@ -169,3 +170,15 @@ def test_requests_that_wait_are_counted_until_they_fail():
         assert requests.waiting == 1
         raise KeyError
     assert requests.waiting == 0
+
+
+def test_timer_of_a_request_ends_also_if_its_future_raises():
+    timers = []
+    node = SimpleNamespace(
+        create_timer=lambda *_: timers.append('timer') or 'timer', destroy_timer=timers.remove
+    )
+    failing = Future()
+    failing.set_exception(OSError('no'))
+    with pytest.raises(OSError, match='no'):
+        within(node, 1.0, failing, lambda: None).send(None)
+    assert not timers

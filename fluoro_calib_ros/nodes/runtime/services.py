@@ -159,9 +159,10 @@ async def within(
 ) -> Any:
     """Return the result of a Future; call give_up(), which must set it, after the timeout."""
     timer = node.create_timer(timeout_s, give_up)
-    result = await future
-    node.destroy_timer(timer)
-    return result
+    try:
+        return await future
+    finally:
+        node.destroy_timer(timer)
 
 
 def in_thread(node: Node, function: Callable[[], Any]) -> tuple[Future, threading.Thread]:

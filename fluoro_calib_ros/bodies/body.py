@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 from itertools import combinations
@@ -18,6 +18,7 @@ from ..brief import brief_repr
 from ..errors import DataError
 from ..photogrammetry.rotations import cross_matrix
 from ..photogrammetry.unknowns import POSE_SIZE
+from ..rows import chosen_rows
 
 AXIS_MM = 20.0  # length of a drawn axis, about the size of a cluster of markers in a bone
 
@@ -245,8 +246,7 @@ class BodyPoses:
 
     def rows(self, chosen: NDArray[np.bool_]) -> BodyPoses:
         """Return the poses of a subset of the exposures, chosen (T,)."""
-        names = (entry.name for entry in fields(self) if entry.name != 'body')
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        return chosen_rows(self, chosen)
 
     @property
     def covariance(self) -> NDArray[np.float64]:

@@ -12,8 +12,7 @@ trial; then the whole trial is smoothed, or reported with the same lag and the s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import cross_matrix
 from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
+from ..rows import joined_rows
 from .body import Body, BodyPoses, PoseStatus
 from .joints import Joint, JointMotion, JointStatus, joint_motion, with_neutral
 from .motion import POSE, Motion, MotionFilter, smooth_trial
@@ -397,20 +397,11 @@ class JointTracker:
             )
             return
         try:
-            trials = (_joined(poses) for poses in zip(*collected))
+            trials = (joined_rows(poses) for poses in zip(*collected))
             self.joint = with_neutral(self.joint, *trials)
             self.needs_neutral = False
         except DataError as error:
             self.error = error
-
-
-def _joined(poses: Sequence[BodyPoses]) -> BodyPoses:
-    """Return the poses of several exposures as those of one trial."""
-    names = [entry.name for entry in fields(BodyPoses) if entry.name != 'body']
-    values: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in poses]) for name in names
-    }
-    return replace(poses[0], **values)
 
 
 def unknown_motion(motion: JointMotion) -> JointMotion:

@@ -24,7 +24,7 @@ deforming it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ from ..bodies.shapes import REGULAR, learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
+from ..rows import chosen_rows, joined_rows
 from .drift_charts import DriftOptions, ImageAreas
 
 COMPONENTS = 2  # components of a shift in an image, u and v
@@ -205,7 +206,7 @@ class BodyWatch:
             return BodyBlock(zeros, zeros, np.zeros(shape), np.zeros(shape, bool), 0)
         body = rows % len(self.bodies)
         has_marker = has_marker[rows]
-        points = ImagePoints(*(getattr(seen.points, e.name)[rows] for e in fields(ImagePoints)))
+        points = chosen_rows(seen.points, rows)
         points = replace(points, seen=points.seen & has_marker[..., None])
         places = np.where(has_marker[..., None], seen.places[rows], 0.0)
         pose = fitted_pose(self._xyz[body], places, has_marker.astype(float))
@@ -351,17 +352,11 @@ def _by_area(
 
 def _joined(seen: Sequence[_Seen]) -> _Seen:
     """Return all exposures as a single one with correspondingly more bodies."""
-    points = ImagePoints(
-        *(
-            np.concatenate([getattr(exposure.points, entry.name) for exposure in seen])
-            for entry in fields(ImagePoints)
-        )
-    )
+    points = joined_rows([exposure.points for exposure in seen])
     return _Seen(points, np.concatenate([exposure.places for exposure in seen]))
 
 
 def _row(seen: _Seen, row: int) -> _Seen:
     """Return one body of an exposure."""
     chosen = slice(row, row + 1)
-    points = ImagePoints(*(getattr(seen.points, e.name)[chosen] for e in fields(ImagePoints)))
-    return _Seen(points, seen.places[chosen])
+    return _Seen(chosen_rows(seen.points, chosen), seen.places[chosen])

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ..exposures.frame import cells_of
 from ..findings import Finding, Severity
 from ..options import option, validate_options
+from ..rows import chosen_rows, joined_rows
 
 # Levels of an alarm; the values are those of the message DriftStatus.
 OK = Severity.NOTE
@@ -247,19 +248,12 @@ class EpipolarObservations:
         for field in fields(self):
             finite = np.isfinite(getattr(self, field.name))
             is_usable &= finite if finite.ndim == 1 else finite.all(axis=1)
-        return EpipolarObservations(
-            *(getattr(self, field.name)[is_usable] for field in fields(self))
-        )
+        return chosen_rows(self, is_usable)
 
     @classmethod
     def concatenate(cls, parts: Sequence[EpipolarObservations]) -> EpipolarObservations:
         """Return all rows of one or more observations, in order."""
-        return cls(
-            *(
-                np.concatenate([getattr(part, field.name) for part in parts])
-                for field in fields(cls)
-            )
-        )
+        return joined_rows(parts)
 
 
 # Areas of an image in which the drift watch tests for a drift.

@@ -30,6 +30,7 @@ from ..healing.sizes import ChangeStatistics, parts_of_interior, parts_of_knock
 from ..photogrammetry.noise import CERTAIN, NORMAL_MEDIAN
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
+from ..rows import joined_rows
 
 WINDOW = 8  # newest blocks from which a change is estimated
 SIZES = np.geomspace(2.0**-7, 4.0, 10)  # sizes of a change, relative to a knock
@@ -112,7 +113,7 @@ class RigChange:
         self._open = [[] for _ in self._pairs]
         if not parts:
             return
-        rays = _joined(parts)
+        rays = joined_rows(parts)
         if len(rays.residual) < MIN_MARKERS:
             return
         self._blocks.append(rays)
@@ -153,7 +154,7 @@ class RigChange:
         newest = list(self._blocks)[-max(blocks, 1) :]
         if not newest:
             return None
-        rays = _joined(newest)
+        rays = joined_rows(newest)
         # The systematic error of a stationary marker does not average out.
         variance = rays.noise + len(newest) * rays.systematic
         broad = np.sqrt(np.sum([sd**2 for sd in self._hypotheses], axis=0)) * SIZES[-1]
@@ -182,15 +183,6 @@ class RigChange:
 def _cap(residual: NDArray[np.float64]) -> float:
     """Return the square of a residual above which it counts as false in a mean."""
     return float(9 * np.median(residual**2) / NORMAL_MEDIAN**2)
-
-
-def _joined(parts: Sequence[_Rays]) -> _Rays:
-    return _Rays(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ('residual', 'noise', 'systematic', 'by_rig', 'is_apart')
-        )
-    )
 
 
 def _hypotheses(orientation: RigOrientation) -> list[NDArray[np.float64]]:

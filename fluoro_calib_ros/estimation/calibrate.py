@@ -34,6 +34,7 @@ from ..photogrammetry.precision import (
 )
 from ..photogrammetry.rig_orientation import KnownOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
+from ..rows import joined_rows
 from .constraints import relative_orientations
 from .fixed_calibration import (
     SolvedNetwork,
@@ -54,7 +55,6 @@ from .lack_of_fit import fitted_profile
 from .options import CalibrationOptions, CalibrationRequest
 from .result import CalibrationResult, ExposureResult, FluoroscopeResult, Targets, combined_targets
 from .rounds import (
-    ResidualTable,
     Round,
     SelfCalibration,
     correlations_of,
@@ -163,7 +163,7 @@ def calibrate_request(
         statistics=tuple(
             statistics_of(run.measured, run.after, run.precision) for run in runs.values()
         ),
-        residuals=ResidualTable.joined(
+        residuals=joined_rows(
             [
                 residuals_of_adjustment(run.measured, run.after, run.precision, run.correction)
                 for run in runs.values()

@@ -190,16 +190,6 @@ class ResidualTable:
     #: the image points of the exposure scatter more than those of other exposures
     outlier: NDArray[np.bool_]
 
-    @classmethod
-    def joined(cls, parts: Sequence[ResidualTable]) -> ResidualTable:
-        """Return one table from several."""
-        return cls(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in cls.__dataclass_fields__
-            )
-        )
-
 
 def statistics_of(
     measured: Measured, adjustment: Adjustment, precise: Precision

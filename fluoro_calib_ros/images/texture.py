@@ -11,7 +11,7 @@ window. Its strength is estimated for each window by its likelihood.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit, logsumexp
 
+from ..rows import joined_rows
 from .light import POLYNOMIAL, vertex
 
 DTYPE = np.float32  # type of models and derivatives
@@ -185,14 +186,6 @@ class Spectra:
     freedom: NDArray[np.int64]  #: (g,), degrees of freedom of the residuals
     noise: NDArray[np.floating]  #: (g,), variance of a typical pixel
 
-    @classmethod
-    def joined(cls, parts: Sequence[Spectra]) -> Spectra:
-        """Return the spectra of all windows of several groups."""
-        names = [field.name for field in fields(cls)]
-        return cls(
-            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        )
-
     def strengths(self, excess: float) -> Strengths:
         """Return the variances of the backgrounds, 0 for windows that more likely have none.
 
@@ -291,7 +284,7 @@ class Texture:
         excess: variance of slow waves of the noise over that of white noise.
         """
         spectra = [self._spectra(NO_EDGE, part) for part in parts]
-        strengths = Spectra.joined(spectra).strengths(excess)
+        strengths = joined_rows(spectra).strengths(excess)
         textured = np.flatnonzero(strengths.variance)
         strength = np.zeros_like(self.strength)
         direction = np.full_like(self.across, NO_EDGE)
@@ -306,7 +299,7 @@ class Texture:
             for one in np.unique(across[textured]).tolist():
                 own = order[across[textured] == one]
                 spectra.append(self._spectra(one, tuple(values[own] for values in part)))
-            edges = Spectra.joined(spectra).strengths_at(excess, strengths.scale)
+            edges = joined_rows(spectra).strengths_at(excess, strengths.scale)
             better = _likely(edges.evidence - strengths.evidence[textured])
             strength[rows[textured[better]]] = edges.variance[better]
             direction[rows[textured[better]]] = across[textured[better]]

@@ -12,7 +12,7 @@ The first three columns may contain names instead of ids.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,7 @@ from ..exposures.frame import (
 from ..exposures.names import Names, safe_names, without_trivial
 from ..exposures.phantom import first_repeated, is_positive
 from ..limits import MAX_FRAMES
+from ..rows import chosen_rows, joined_rows
 from .access import PathLike, check_safe_name
 from .csv_table import Block, NamedColumn, Table, read_all, read_blocks, write_table
 
@@ -58,7 +59,7 @@ class _Rows:
     line: NDArray[np.int64]  #: (n,), number of the row in the file
 
     def __getitem__(self, rows: np.ndarray) -> _Rows:
-        return _Rows(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return chosen_rows(self, rows)
 
 
 def read_observations_csv(
@@ -124,7 +125,7 @@ def _read(
             f'{path}: a CSV file does not contain the image size, --image-size WxH is needed'
         )
     blocks = read_blocks(path, COLUMNS)
-    rows = _concatenate([_parse(block, columns) for block in blocks])
+    rows = joined_rows([_parse(block, columns) for block in blocks])
     rows, stray = _on_image(path, rows, image_size, columns.known is not None)
     rows = replace(
         rows,
@@ -267,12 +268,6 @@ def _parse(block: Block, columns: _Columns) -> _Rows:
         sigma=sigma,
         angle=angle,
         line=block.lines,
-    )
-
-
-def _concatenate(parts: Sequence[_Rows]) -> _Rows:
-    return _Rows(
-        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(_Rows))
     )
 
 

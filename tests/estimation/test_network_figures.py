@@ -47,6 +47,7 @@ from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
 from fluoro_calib_ros.photogrammetry.unknowns import mean_pose, relative_poses
+from fluoro_calib_ros.rows import joined_rows
 
 SIZE = (1024, 1024)
 
@@ -138,7 +139,7 @@ def test_residuals_are_listed_by_fluoroscope_exposure_and_target():
     assert table.correction is correction
     np.testing.assert_array_equal(table.outlier, ~after.inliers)
     np.testing.assert_allclose(table.weight, after.noise.weight(after.q))
-    both = table.joined([table, table])
+    both = joined_rows([table, table])
     assert (
         len(both.uv) == 2 * len(table.uv)
         and both.target_id[len(table.uv) + row] == 101 + found.network.point[row]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..brief import brief_repr
 from ..errors import DataError
+from ..exposures.phantom import first_repeated
 from ..photogrammetry.rotations import cross_matrix
 from ..photogrammetry.unknowns import POSE_SIZE
 from ..rows import chosen_rows
@@ -69,11 +70,11 @@ class Body:
             )
         if not len(target_id):
             raise DataError(f'body {self.name}: it has no markers')
-        order = np.argsort(target_id, kind='stable')
+        repeated = first_repeated(target_id)
+        if repeated is not None:
+            raise DataError(f'body {self.name}: marker {target_id[repeated[0]]} is given twice')
+        order = np.argsort(target_id)
         target_id = target_id[order]
-        repeated = target_id[1:][np.diff(target_id) == 0]
-        if len(repeated):
-            raise DataError(f'body {self.name}: marker {repeated[0]} is given twice')
         known = np.isfinite(xyz).all(axis=1)[order]
         is_invalid = (known & ~(sd[order] >= 0)) | np.isinf(xyz[order]).any(axis=1)
         if is_invalid.any():

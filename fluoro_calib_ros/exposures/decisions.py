@@ -97,8 +97,7 @@ def _decided(frame: Frame, decisions: Sequence[PointDecision]) -> tuple[Frame | 
             f'{cause.where}: exposure {frame.number} then has target {repeated_id} twice; decide '
             'on the other image point as well'
         )
-    sigma = None if frame.sigma is None else frame.sigma[keep]
-    changed = replace(frame, target_id=ids[keep], uv=frame.uv[keep], sigma=sigma)
+    changed = replace(frame, target_id=ids).rows(keep)
     renamed = int(np.count_nonzero(ids[keep] != frame.target_id[keep]))
     return changed, int((~keep).sum()), renamed
 

@@ -79,8 +79,9 @@ class Frame:
 
     def rows(self, chosen: NDArray[np.bool_]) -> Frame:
         """Return the frame restricted to some of its targets (n,)."""
+        target_id, uv = np.asarray(self.target_id)[chosen], np.asarray(self.uv)[chosen]
         sigma = None if self.sigma is None else np.asarray(self.sigma)[chosen]
-        return replace(self, target_id=self.target_id[chosen], uv=self.uv[chosen], sigma=sigma)
+        return replace(self, target_id=target_id, uv=uv, sigma=sigma)
 
     def sorted(self) -> Frame:
         """Return the frame with its targets in ascending order.
@@ -366,13 +367,6 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
     stray = single_stray | coincident
     if not stray.any() or stray.all():
         return frame, None
-    kept = ~stray
-    cleaned = replace(
-        frame,
-        target_id=ids[kept],
-        uv=uv[kept],
-        sigma=None if frame.sigma is None else np.asarray(frame.sigma)[kept],
-    )
     causes = [
         f'target {first_few(ids[mask])} {cause}'
         for mask, cause in (
@@ -386,7 +380,7 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
         if mask.any()
     ]
     count = int(stray.sum())
-    return cleaned, Finding(
+    return frame.rows(~stray), Finding(
         Kind.STRAY_POINTS,
         f'{count} image point{"s" * (count > 1)}, {" and ".join(causes)}',
         replace(frame.place, target_id=tuple(ids[stray].tolist())),

@@ -264,8 +264,8 @@ def test_corrected_frame_is_validated(changes, kind):
     with pytest.raises(Refused) as error:
         validate_corrected('a', corrected(**changes))
     assert error.value.kind == kind
-    if kind == 'sigma':
-        assert 'target 6 ' in str(error.value)
+    if kind in ('sigma', 'repeated target'):
+        assert f'target {changes.get("target_id", [6])[0]} ' in str(error.value)
 
 
 def test_points_of_a_frame_are_limited_by_number():

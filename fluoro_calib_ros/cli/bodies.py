@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, ErrorsAt
 from ..findings import Severity
@@ -169,22 +171,39 @@ def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:
 
     summary = outcome.summary()
     lines = [f'{len(outcome.exposures)} exposures, written to {arguments.out}']
-    lines += [
-        f'{name}: {figures["poses"]} poses, sd {figures["sd_mm"]:.3f} mm and '
-        f'{figures["sd_deg"]:.3f} degrees (medians); condition number '
-        f'{figures["condition_per_m"]:.0f} per m, mean error of the rigid body '
-        f'{figures["mean_error_mm"]:.3f} mm'
-        for name, figures in summary['bodies'].items()
-    ]
-    lines += [
-        f'{joint}: {name} over {figures["range_deg"]:.1f} degrees, sd {figures["sd_deg"]:.3f} '
-        '(median)'
-        for joint, angles in summary['joints'].items()
-        for name, figures in angles.items()
-    ]
+    lines += [_body_line(name, figures) for name, figures in summary['bodies'].items()]
+    for joint, angles in summary['joints'].items():
+        lines += _joint_lines(joint, angles)
     document = {
         'out': str(arguments.out),
         **summary,
         'findings': [finding_document(finding) for finding in outcome.findings],
     }
     print_result(arguments, document, '\n'.join(lines))
+
+
+def _body_line(name: str, figures: Mapping[str, Any]) -> str:
+    """Return poses and shape of a body as text, without figures that are not known."""
+    poses = 'no pose'
+    if figures['poses']:
+        poses = (
+            f'{figures["poses"]} poses, sd {figures["sd_mm"]:.3f} mm and '
+            f'{figures["sd_deg"]:.3f} degrees (medians)'
+        )
+    shape = {
+        'condition number {:.0f} per m': figures['condition_per_m'],
+        'mean error of the rigid body {:.3f} mm': figures['mean_error_mm'],
+    }
+    known = [text.format(value) for text, value in shape.items() if not math.isnan(value)]
+    return f'{name}: ' + '; '.join(filter(None, [poses, ', '.join(known)]))
+
+
+def _joint_lines(joint: str, angles: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Return the ranges of the angles of a joint as lines of text."""
+    if all(math.isnan(figures['range_deg']) for figures in angles.values()):
+        return [f'{joint}: no angles: no exposure has poses of both bodies']
+    return [
+        f'{joint}: {name} over {figures["range_deg"]:.1f} degrees, sd {figures["sd_deg"]:.3f} '
+        '(median)'
+        for name, figures in angles.items()
+    ]

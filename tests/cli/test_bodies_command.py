@@ -203,8 +203,9 @@ def test_a_result_is_replaced_as_a_whole_and_only_by_a_result(knee, tmp_path):
     assert (knee / 'result' / 'result.json').exists()
 
 
-def test_shapes_can_be_kept(knee, tmp_path):
+def test_shapes_can_be_kept(knee, tmp_path, capsys):
     assert bodies(knee, tmp_path / 'motion', '--keep-shapes', '--smooth', 'none') == 0
+    assert 'nan' not in capsys.readouterr().out
     given = rows(knee / 'bodies.csv')
     kept = rows(tmp_path / 'motion' / 'shapes.csv')
     assert [float(row['x']) for row in given] == [float(row['x']) for row in kept]
@@ -242,6 +243,19 @@ def test_mirrored_coordinates_are_not_a_success(knee, tmp_path, capsys):
     assert run(*arguments, '--json') == 3
     document = json.loads(capsys.readouterr().out)
     assert 'body_mirrored' in [f['kind'] for f in document['findings']]
+
+
+@pytest.mark.filterwarnings('error')
+def test_bodies_and_joints_without_poses_have_no_figures(knee, tmp_path, capsys):
+    """Coordinates in cm fit nowhere; nothing is printed about poses and angles that are not."""
+    header, *lines = (knee / 'bodies.csv').read_text().splitlines()
+    cells = [line.split(',') for line in lines]
+    in_cm = [[*row[:2], *(f'{float(x) / 10}' for x in row[2:5]), row[5]] for row in cells]
+    (tmp_path / 'cm.csv').write_text('\n'.join([header, *map(','.join, in_cm)]))
+    files = ('--bodies', tmp_path / 'cm.csv', '--joints', knee / 'joints.toml')
+    assert bodies(knee, tmp_path / 'motion', *files) == 3
+    out = capsys.readouterr().out
+    assert 'femur: no pose' in out and 'knee: no angles' in out and 'nan' not in out
 
 
 @pytest.mark.parametrize(

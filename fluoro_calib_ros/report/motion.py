@@ -119,7 +119,8 @@ def paths_figure(poses: Sequence[BodyPoses]) -> Figure:
                     axes.plot(*np.stack([origin, end]).T, color=colour, linewidth=0.8)
         axes.set(xlabel='x [mm]', ylabel='y [mm]', zlabel='z [mm]')
         axes.set_aspect('equal')
-        axes.legend(loc='upper left')
+        if axes.lines:
+            axes.legend(loc='upper left')
         figure.supxlabel('axes of the bodies: x red, y grey, z blue', fontsize=9)
     return figure
 

@@ -23,7 +23,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.fluoroscope_calibration import Calibrations
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..estimation.pair_scatter import MOVED_SHARE, PairScatter, steps_of
@@ -151,22 +151,26 @@ def contradiction(
     )
 
 
-def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool, list[Finding]]:
+def doubtful(
+    scatter: PairScatter, side_px: int, noise_px: float, correction_px: float = 0.0
+) -> tuple[bool, list[Finding]]:
     """Return whether exposures determine an orientation of a rig, and doubts about it.
 
     side_px: longer side of the image. noise_px: a displacement below it is within the noise of
-    points. Without an orientation the finding contains the reason.
+    points. correction_px: standard deviation of the corrections of both fluoroscopes. Without an
+    orientation the finding contains the reason.
     """
     a, b = scatter.fluoroscopes
     off_px = float(np.median(scatter.off_px[scatter.used]))
     place = Place((a, b), name=ORIENTED)
-    if scatter.unexplained > DOUBTFUL_GROWTH and off_px >= noise_px:
+    limit_px = _limit_px(scatter, noise_px, correction_px)
+    if scatter.unexplained > DOUBTFUL_GROWTH and off_px >= limit_px:
         usable = off_px <= MAX_MISFIT * side_px or scatter.unexplained <= MAX_GROWTH
         kind, exposures, reason = _cause(scatter)
         finding = Finding(
             kind,
             'the exposures contradict each other: the relative orientation of fluoroscopes '
-            f'{a} and {b} differs between them by {off_px:.1f} px, {scatter.unexplained:.0f} '
+            f'{a} and {b} differs between them by {_px(off_px)}, {scatter.unexplained:.1f} '
             f'times its standard deviation; {reason}',
             Place((a, b), exposures, name=ORIENTED if usable else NOT_ORIENTED),
             severity=Severity.WARNING,
@@ -190,7 +194,7 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
         finding = Finding(
             Kind.RIG_DEPENDS_ON_ANGLE,
             f'the relative orientation of fluoroscopes {a} and {b} changes with the angle of the '
-            f'C-arm, by {scatter.angle_px:.1f} px',
+            f'C-arm, by {_px(scatter.angle_px)}',
             place=place,
             advice='it holds for the mean angle; orient the rig from a capture at the angle in '
             'use',
@@ -201,12 +205,30 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
     return True, out
 
 
+def _limit_px(scatter: PairScatter, noise_px: float, correction_px: float) -> float:
+    """Return the displacement [px] from which the scatter of pairs is doubtful.
+
+    The standard deviations of the pairs take the errors of corrections for independent noise of
+    the image points, of which the mean over an exposure is left. They are smooth: at worst an
+    orientation takes over all of them, with the standard deviation correction_px.
+    """
+    off_px = float(np.median(scatter.off_px[scatter.used]))
+    predicted = off_px / max(scatter.unexplained, 1.0)
+    return max(noise_px, DOUBTFUL_GROWTH * float(np.hypot(predicted, correction_px)))
+
+
+def _px(displacement: float) -> str:
+    """Return a displacement as text, with two digits where it is small."""
+    return f'{displacement:.2g} px' if displacement < 1 else f'{displacement:.1f} px'
+
+
 def _size(off_px: NDArray[np.float64]) -> str:
     """Return displacements of image points as text."""
     low, high = float(np.min(off_px)), float(np.max(off_px))
     if not np.isfinite(high):
-        return f'{low:.1f} px and more' if np.isfinite(low) else 'more than the image shows'
-    return f'{low:.1f} px' if high - low < 0.05 else f'{low:.1f} to {high:.1f} px'
+        return f'{_px(low)} and more' if np.isfinite(low) else 'more than the image shows'
+    from_low = _px(low).removesuffix(' px')
+    return _px(low) if high - low < 0.05 else f'{from_low} to {_px(high)}'
 
 
 def _cause(scatter: PairScatter) -> tuple[Kind, tuple[int, ...], str]:
@@ -268,6 +290,8 @@ class RigFindings:
     #: for every fluoroscope except the first; empty if unknown
     scatter: tuple[PairScatter, ...] = ()
     noise_px: float = 0.0  #: largest standard deviation of an image coordinate [px]
+    #: for every entry of scatter, standard deviation of the corrections of both fluoroscopes [px]
+    correction_px: tuple[float, ...] = ()
     trusted: tuple[Finding, ...] = field(default=())  #: unverified assumptions
 
     @property
@@ -319,7 +343,11 @@ def rig_findings(
         )
         return RigFindings(names, None, (finding,), noise_px=noise)
     side = max(max(calibration.image_size) for calibration in calibrations.values())
-    tested = [doubtful(pairs, side, noise) for pairs in scatter]
+    corrections = {name: _correction_sd(frames[name], calibrations[name]) for name in names}
+    correction_px = tuple(
+        float(np.hypot(*(corrections[name] for name in pairs.fluoroscopes))) for pairs in scatter
+    )
+    tested = [doubtful(pairs, side, noise, sd) for pairs, sd in zip(scatter, correction_px)]
     refused = tuple(doubt for usable, doubts in tested for doubt in doubts if not usable)
     doubts = refused or tuple(doubt for _, doubts in tested for doubt in doubts)
     assumptions = tuple(_trusted(frames, pairs, noise) for pairs in scatter)
@@ -329,7 +357,17 @@ def rig_findings(
         doubts,
         scatter,
         noise_px=noise,
+        correction_px=correction_px,
         trusted=tuple(assumption for assumption in assumptions if assumption is not None),
+    )
+
+
+def _correction_sd(frames: Sequence[Frame], calibration: FluoroscopeCalibration) -> float:
+    """Return the median standard deviation of the correction of the image points [px]."""
+    return float(
+        np.median(
+            np.concatenate([calibration.correction(frame.uv, frame.angle).sd for frame in frames])
+        )
     )
 
 
@@ -352,14 +390,14 @@ def check_rig(findings: RigFindings) -> list[Check]:
                 unit='largest of a rig' if contradicts else '',
             )
         ]
-    return [_check(findings, pairs) for pairs in findings.scatter]
+    corrections = findings.correction_px or (0.0,) * len(findings.scatter)
+    return [_check(findings, pairs, sd) for pairs, sd in zip(findings.scatter, corrections)]
 
 
-def _check(findings: RigFindings, pairs: PairScatter) -> Check:
+def _check(findings: RigFindings, pairs: PairScatter, correction_px: float) -> Check:
     """Return the check of the scatter of the pairs of two fluoroscopes."""
     a, b = pairs.fluoroscopes
     off_px = float(np.median(pairs.off_px[pairs.used]))
-    predicted = off_px / max(pairs.unexplained, 1.0)
     doubts = [doubt for doubt in findings.doubts if doubt.place.fluoroscopes == (a, b)]
     doubts = [doubt for doubt in doubts if doubt.kind in (Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED)]
     cause = (
@@ -373,7 +411,7 @@ def _check(findings: RigFindings, pairs: PairScatter) -> Check:
         '' if doubts and doubts[0].kind is Kind.RIG_MOVED else CAPTURE,  # its cause contains it
         numbers={'ratio': float(pairs.unexplained), 'noise_px': findings.noise_px},
         value=off_px,
-        limit=max(findings.noise_px, DOUBTFUL_GROWTH * predicted),
+        limit=_limit_px(pairs, findings.noise_px, correction_px),
         unit='px',
     )
 
@@ -390,7 +428,7 @@ def _trusted(frames: Frames, pairs: PairScatter, noise_px: float) -> Finding | N
         return None
     reason = 'they have no stamps'
     if moved_px is not None:
-        reason = f'by their stamps the image moves by {moved_px:.1f} px between them'
+        reason = f'by their stamps the image moves by {_px(moved_px)} between them'
     return Finding(
         Kind.TAKEN_ON_TRUST,
         f'the orientation of fluoroscopes {a} and {b} assumes that frames with the same number '

@@ -176,6 +176,7 @@ def test_rig_that_was_moved_once_is_told_with_its_move():
 
 def test_size_of_displacements_is_a_number_a_range_or_a_bound():
     assert rig._size(np.array([2.0, 2.04])) == '2.0 px'
+    assert rig._size(np.array([0.036, 0.04])) == '0.036 px'
     assert rig._size(np.array([3.5, 2.0])) == '2.0 to 3.5 px'
     assert rig._size(np.array([2.0, np.inf])) == '2.0 px and more'
     assert rig._size(np.array([np.inf])) == 'more than the image shows'
@@ -248,7 +249,9 @@ def stamped(number, stamp_ns, u):
     return Frame('a', number, np.arange(10), uv, (1000, 800), stamp_ns=stamp_ns)
 
 
-def findings_of(monkeypatch, scatters, figures=None, delay_ns=0, known=()):
+def findings_of(
+    monkeypatch, scatters, figures=None, delay_ns=0, known=(), correction_sd=0.01
+):
     """Findings on three fluoroscopes whose pairs scatter as given."""
     names = ('a', 'b', 'c')[: len(scatters) + 1] if isinstance(scatters, list) else ('a', 'b')
     asked = {}
@@ -267,7 +270,12 @@ def findings_of(monkeypatch, scatters, figures=None, delay_ns=0, known=()):
         for i, name in enumerate(names)
     }
     calibrations = {
-        name: Fake(image_sd=0.2 + 0.1 * i, image_size=(1000, 800)) for i, name in enumerate(names)
+        name: Fake(
+            image_sd=0.2 + 0.1 * i,
+            image_size=(1000, 800),
+            correction=lambda uv, angle: Fake(sd=np.full(len(uv), correction_sd)),
+        )
+        for i, name in enumerate(names)
     }
     result = Fake(
         fluoroscopes=figures or dict.fromkeys(names[:1], calm), calibrations='c', starts='s'
@@ -296,6 +304,25 @@ def test_rig_of_which_one_pair_is_useless_has_no_orientation(monkeypatch):
     assert [one.place.fluoroscopes for one in found.doubts] == [('a', 'c')]
     found, _ = findings_of(monkeypatch, [doubted])
     assert found.orientation == 'orientation' and len(found.doubts) == 1
+
+
+@pytest.mark.parametrize(('correction_sd', 'is_doubted'), [(0.55, True), (0.56, False)])
+def test_scatter_within_the_deviation_of_the_corrections_is_no_contradiction(
+    monkeypatch, correction_sd, is_doubted
+):
+    """The limit is twice 2.1 / 3 px, as predicted for the pairs, and both corrections."""
+    pairs = [scatter(off_px=2.1, unexplained=3.0)]
+    found, _ = findings_of(monkeypatch, pairs, correction_sd=correction_sd)
+    assert bool(found.doubts) is is_doubted
+    (check,) = check_rig(found)
+    assert check.passed is not is_doubted
+    assert check.limit == pytest.approx(2 * np.sqrt(0.7**2 + 2 * correction_sd**2))
+
+
+@pytest.mark.parametrize(('off_px', 'text'), [(0.036, ' 0.036 px'), (4.04, ' 4.0 px')])
+def test_a_difference_that_matters_does_not_read_zero(off_px, text):
+    _, (found,) = doubtful(scatter(off_px=off_px), 1000, 0.02)
+    assert text in found.cause and '3.0 times' in found.cause
 
 
 def test_rig_without_pairs_or_with_contradicting_ones_says_why(monkeypatch):

@@ -214,8 +214,10 @@ def load_orientation(path: PathLike) -> RigOrientation:
 
     If the calibrations next to it were written by an earlier version, the orientation refers to
     them by their current ids, and its own id changes accordingly. Raises DataError for a file that
-    is not a rig orientation, is damaged or was changed, or has an unknown layout version.
+    is not a rig orientation, is damaged or was changed, or has an unknown layout version, and with
+    the reason where a folder has calibrations without an orientation.
     """
+    _check_oriented(Path(path))
     values = to_values(read_arrays(path, ORIENTATION_LAYOUT))
     identity = values.pop('orientation_id')
     max_fluoroscopes = read_limits().max_fluoroscopes
@@ -239,6 +241,23 @@ def load_orientation(path: PathLike) -> RigOrientation:
     if present_ids == orientation.calibration_ids:
         return orientation
     return replace(orientation, calibration_ids=present_ids)
+
+
+def _check_oriented(path: Path) -> None:
+    """Raise DataError if a folder has calibrations, but no orientation was determined."""
+    folder = path.parent
+    if path.name != ORIENTATION_NAME or path.exists() or not any(folder.glob(f'*{SUFFIX}')):
+        return
+    note = ''
+    with suppress(DataError):  # reported where the document is used
+        note = read_result(folder).get('rig_note', '')
+    raise DataError(
+        note if note and isinstance(note, str) else 'no orientation of the rig was determined',
+        at=folder,
+        kind=Kind.RIG_NOT_ORIENTED,
+        advice='calibrate all fluoroscopes from the same exposures, or orient the rig with '
+        'fluoro-calib orient',
+    )
 
 
 def _present_ids(path: PathLike, orientation: RigOrientation) -> tuple[str, ...]:

@@ -697,8 +697,15 @@ def test_reconstruct_refuses_invalid_input_in_one_sentence(folder, tmp_path, cap
     assert 'the orientation has to be determined again' in said(
         capsys, *source, other, '--out', out, '--orientation', result / 'rig_orientation.npz'
     )
-    assert 'rig_orientation.npz: there is no such file' in said(
+    message = said(capsys, *source, other, '--out', out)
+    assert f'{other}: no orientation of the rig was determined' in message
+    assert 'fluoro-calib orient' in message
+    (other / 'result.json').write_text('{"rig_note": "no orientation of the rig: why"}')
+    assert f'{other}: no orientation of the rig: why: cal' in said(
         capsys, *source, other, '--out', out
+    )
+    assert 'x.npz: there is no such file' in said(
+        capsys, *source, other, '--out', out, '--orientation', tmp_path / 'x.npz'
     )
     assert 'are needed' in said(capsys, *source, result, '--out', out, '--fluoroscopes', 'a')
     assert "there is no fluoroscope 'c'" in said(

@@ -29,7 +29,7 @@ from scipy.special import chdtri, ndtr
 
 from ..brief import brief_repr
 from ..errors import DataError
-from ..exposures.phantom import MISTAKEN_UNITS
+from ..exposures.phantom import mistaken_unit
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.rotations import cross_matrix, nearest_rotation
@@ -47,9 +47,6 @@ FALSE_SHARE = 0.05
 MAX_CONDITION = 120.0
 MAX_MEAN_ERROR_MM = 0.35
 REJECT_TAIL = 2 * float(ndtr(-CERTAIN))
-# Relative tolerance for recognising another unit of the coordinates, from the fit of the shape to
-# points in space.
-SCALE_TOLERANCE = 0.05
 REGULAR = 1e-10  # share of a normal matrix' largest element that is added to its diagonal
 _MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
 
@@ -532,14 +529,14 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
     measured = places.xyz_mm[row][seen[row]]
     spread = [np.sqrt(np.sum((x - x.mean(axis=0)) ** 2)) for x in (ct, measured)]
     factor = float(spread[1] / spread[0])
-    for scale, unit in MISTAKEN_UNITS.items():
-        if abs(factor / scale - 1) < SCALE_TOLERANCE:
-            cause = (
-                f'its coordinates are in {unit}, not in mm: distances in space are {factor:.4g} '
-                'times larger'
-            )
-            numbers = {'factor': factor}
-            return [Finding(Kind.WRONG_UNIT, cause, place=_place(body), numbers=numbers)]
+    unit = mistaken_unit(factor)
+    if unit:
+        cause = (
+            f'its coordinates are in {unit}, not in mm: distances in space are {factor:.4g} '
+            'times larger'
+        )
+        numbers = {'factor': factor}
+        return [Finding(Kind.WRONG_UNIT, cause, place=_place(body), numbers=numbers)]
     if count[row] < 4:
         return []
     errors = []

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from scipy.special import chdtri
 
 from ..estimation.survey import SurveyedBeads
+from ..exposures.phantom import SCALE_TOLERANCE, mistaken_unit
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.network import DATUM_DEFECT, MIN_RAYS, similarity_directions
 from ..photogrammetry.outliers import CONTRADICTION
@@ -63,7 +64,9 @@ def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
 
 
 def displaced(beads: SurveyedBeads) -> Finding | None:
-    """Return a finding for beads that are not at their given coordinates."""
+    """Return a finding for beads that are not at their given coordinates, in the same unit."""
+    if _wrong_unit(beads) is not None:
+        return None
     variance = beads.covariance + beads.given_sd_mm[:, None, None] ** 2 * np.eye(3)
     offset = beads.xyz_mm - beads.given_mm
     square = np.einsum('na,nab,nb->n', offset, np.linalg.inv(variance), offset)
@@ -84,7 +87,13 @@ def displaced(beads: SurveyedBeads) -> Finding | None:
 
 
 def check_survey(beads: SurveyedBeads) -> list[Check]:
-    """Return the checks of the geometry, the scale, the ids and the precision of a survey."""
+    """Return the checks of the geometry, the scale, the ids and the precision of a survey.
+
+    If the unit of the distances is wrong, nothing else in mm is checked.
+    """
+    wrong_unit = _wrong_unit(beads)
+    if wrong_unit is not None:
+        return [_check_intersection(beads), wrong_unit]
     return [
         _check_intersection(beads),
         _check_distances(beads),
@@ -166,6 +175,27 @@ def _check_intersection(beads: SurveyedBeads) -> Check:
         limit=1 / np.tan(MIN_ANGLE_RAD / 2),
         unit='error along a ray over that across',
     )
+
+
+def _wrong_unit(beads: SurveyedBeads) -> Check | None:
+    """Return the failed check of distances that are in another unit than the coordinates."""
+    for factor, wrong, right in (
+        (1 / beads.scale, 'measured distances', 'given coordinates'),
+        (beads.scale, 'given coordinates', 'measured distances'),
+    ):
+        unit = mistaken_unit(factor)
+        if beads.scaled is not None and unit:
+            return Check(
+                Kind.WRONG_UNIT,
+                f'the {wrong} are in {unit}, not in mm: by the {right} lengths are '
+                f'{factor:.4g} times larger',
+                advice=f'give the {wrong} in mm',
+                numbers={'factor': factor, 'scale': beads.scale},
+                value=factor,
+                limit=1 + SCALE_TOLERANCE,
+                unit='ratio of lengths',
+            )
+    return None
 
 
 def _check_distances(beads: SurveyedBeads) -> Check:

@@ -21,7 +21,15 @@ MIN_TARGETS = 4
 EXTENT_MM = (2.0, 10_000.0)
 UNITS_MM = {'m': 1000.0, 'cm': 10.0, 'micrometres': 1e-3}
 MISTAKEN_UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # mistaken for mm; keys in mm
+# Relative tolerance for recognising another unit of lengths from the ratio to other ones.
+SCALE_TOLERANCE = 0.05
 EXACT_SD_MM = 1e-6  # coordinates with a smaller sd count as known; files have six decimals
+
+
+def mistaken_unit(factor: float) -> str:
+    """Return the unit of lengths that seem too short by this factor, taken for mm; '' for mm."""
+    units = (u for mm, u in MISTAKEN_UNITS.items() if abs(factor / mm - 1) < SCALE_TOLERANCE)
+    return next(units, '')
 
 
 @dataclass(frozen=True)

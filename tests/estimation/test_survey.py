@@ -317,6 +317,32 @@ def test_a_wrong_distance_is_found_with_its_error():
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ('factor', 'of_distances', 'of_coordinates'),
+    [(0.1, 'cm', ''), (1 / 25.4, 'inches', ''), (1e-3, 'm', ''), (10.0, '', 'cm'), (0.5, '', '')],
+)
+def test_distances_and_coordinates_in_different_units_are_named(
+    factor, of_distances, of_coordinates
+):
+    rig, _, outcome = surveyed()
+    distances = [
+        replace(d, length_mm=factor * d.length_mm, sd_mm=factor * d.sd_mm) for d in measured(rig)
+    ]
+    beads = surveyed_beads(outcome.result, rough(rig), distances)
+    failed = [check for check in check_survey(beads) if check.passed is False]
+    if not of_distances + of_coordinates:
+        assert Kind.WRONG_UNIT not in rigs.kinds(failed) and displaced(beads) is not None
+        return
+    (check,) = failed
+    ratio = factor if of_coordinates else 1 / factor
+    assert check.kind is Kind.WRONG_UNIT
+    assert check.numbers['factor'] == pytest.approx(ratio, rel=0.01)
+    assert f'in {of_distances or of_coordinates}, not in mm' in check.cause
+    assert check.cause.startswith('the measured' if of_distances else 'the given')
+    assert displaced(beads) is None
+
+
+@pytest.mark.long
 @pytest.mark.parametrize('count', [0, 1])
 def test_a_scale_that_nothing_checks_does_not_pass(count):
     rig, _, outcome = surveyed()

@@ -24,6 +24,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 # Widths of columns, in characters.
 LABEL_WIDTH = 36
 COLUMN_WIDTH = 20  # for the values of a fluoroscope
+CELLS = 50  # points across the image at which the calibrated area is sampled: in steps of 2 %
 
 
 def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | None = None) -> str:
@@ -83,6 +84,7 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         **_interior_rows(figures),
         'noise of an image coordinate [px]': _noise_text(calibration),
         'median sd of the correction [px]': number_text(_median_sd(calibration)),
+        'calibrated part of the image [%]': f'{100 * _calibrated_part(calibration):.0f}',
         **_angle_rows(calibration.angle_field),
         'calibration [s]': number_text(calibration.seconds, 1),
     }
@@ -99,6 +101,12 @@ def _median_sd(calibration: FluoroscopeCalibration) -> float:
         return float(np.median(sd))
     squares = [sd**2 + field.change(uv, angle)[1] for angle in field.angles.tolist()]
     return float(np.sqrt(np.maximum(np.median(squares), 0)))
+
+
+def _calibrated_part(calibration: FluoroscopeCalibration) -> float:
+    """Return the part of the image in which points are not outside the calibrated area."""
+    cells = (np.indices((CELLS, CELLS)).reshape(2, -1).T + 0.5) / CELLS
+    return 1 - float(np.mean(calibration.model.outside(cells * calibration.image_size)))
 
 
 def _noise_text(calibration: FluoroscopeCalibration) -> str:

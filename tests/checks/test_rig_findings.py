@@ -249,9 +249,7 @@ def stamped(number, stamp_ns, u):
     return Frame('a', number, np.arange(10), uv, (1000, 800), stamp_ns=stamp_ns)
 
 
-def findings_of(
-    monkeypatch, scatters, figures=None, delay_ns=0, known=(), correction_sd=0.01
-):
+def findings_of(monkeypatch, scatters, figures=None, delay_ns=0, known=(), correction_sd=0.01):
     """Findings on three fluoroscopes whose pairs scatter as given."""
     names = ('a', 'b', 'c')[: len(scatters) + 1] if isinstance(scatters, list) else ('a', 'b')
     asked = {}

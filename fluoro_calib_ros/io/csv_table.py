@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, quoted
 from ..exposures.names import MAX_ID, Names, number_names
+from ..findings import sentence_of
 from ..limits import MAX_ROWS_CSV
 from .access import PathLike, atomic_file, check_rows, check_safe_name, delete_file, read_text
 
@@ -50,9 +52,13 @@ class Block:
         cells = list(map(str.strip, map(itemgetter(self.header.index(name)), self.rows)))
         return list(map(_from_text, cells)) if "'" in ''.join(cells) else cells
 
-    def floats(self, name: str) -> NDArray[np.float64]:
-        """Return a column (n,) of finite numbers. Raises DataError."""
-        values = np.array(self._convert(name, self.strings(name), float, 'a number'))
+    def floats(self, name: str, if_missing: str = '') -> NDArray[np.float64]:
+        """Return a column (n,) of finite numbers. Raises DataError.
+
+        if_missing: advice for an empty cell or NaN.
+        """
+        values = np.array(self._convert(name, self.strings(name), float, 'a number', if_missing))
+        self.require(name, ~np.isnan(values), sentence_of('not a finite number', if_missing))
         self.require(name, np.isfinite(values), 'not a finite number')
         return values
 
@@ -62,8 +68,14 @@ class Block:
         return np.array(self._convert(name, cells, float, 'a number'))
 
     def ids(self, name: str) -> NDArray[np.int64]:
-        """Return a column (n,) of whole numbers from 0 to MAX_ID. Raises DataError."""
-        values = self._convert(name, self.strings(name), int, 'an integer')
+        """Return a column (n,) of whole numbers from 0 to MAX_ID. Raises DataError.
+
+        They may end in .0, as pandas writes them if a row of the column was empty.
+        """
+        cells = self.strings(name)
+        if '.' in ''.join(cells):
+            cells = list(map(without_zeros, cells))
+        values = self._convert(name, cells, int, 'an integer')
         if len(values) and not 0 <= min(values) <= max(values) <= MAX_ID:
             in_range = np.array([0 <= value <= MAX_ID for value in values])
             self.require(name, in_range, f'not between 0 and {MAX_ID}')
@@ -80,7 +92,12 @@ class Block:
         raise DataError(f'{self.path}, row {self.lines[index]}: {cause}')
 
     def _convert(
-        self, name: str, cells: Sequence[str], kind: Callable[[str], Any], expected: str
+        self,
+        name: str,
+        cells: Sequence[str],
+        kind: Callable[[str], Any],
+        expected: str,
+        if_missing: str = '',
     ) -> list[Any]:
         try:
             if '_' in ''.join(cells):  # Python reads 1_0 as 10
@@ -88,7 +105,9 @@ class Block:
             return list(map(kind, cells))
         except ValueError:
             index = next(i for i, cell in enumerate(cells) if not is_number(cell, kind))
-            self.fail(index, f'{name} is {cells[index]!r}, not {expected}')
+            cell = cells[index]
+            advice = decimal_comma_advice(cell) if cell else if_missing
+            self.fail(index, sentence_of(f'{name} is {cell!r}, not {expected}', advice))
 
 
 def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
@@ -130,6 +149,29 @@ def decimal_point(cell: str) -> str:
         return cell
     with_point = cell.replace(',', '.')
     return with_point if is_number(with_point) else cell
+
+
+def decimal_comma_advice(cell: str) -> str:
+    """Return what to do about a decimal comma in a cell that is not a number; '' without one.
+
+    Such a cell is not read: 1,234 may also be 1234 with a comma between thousands.
+    """
+    if decimal_point(cell) == cell:
+        return ''
+    return (
+        'it has a decimal comma; write decimal points, or save the table with semicolons between '
+        'the cells'
+    )
+
+
+# A whole number as pandas writes it in a column of floats.
+_WHOLE = re.compile(r'([+-]?[0-9]+)\.0+')
+
+
+def without_zeros(cell: str) -> str:
+    """Return a whole number such as 7.0 without its decimals; any other cell unchanged."""
+    match = _WHOLE.fullmatch(cell)
+    return cell if match is None else match[1]
 
 
 @dataclass(frozen=True)
@@ -233,8 +275,11 @@ def _check_header(where: str, header: Sequence[str], required: Sequence[str]) ->
     """Raise DataError for missing and repeated columns; the message begins with where."""
     missing = [name for name in required if name not in header]
     if missing:
+        columns = f'has no column {missing[0]}'
+        if len(missing) > 1:
+            columns = f'lacks the columns {", ".join(missing)}'
         raise DataError(
-            f'{where}: the header has no column {" and no column ".join(missing)}; '
+            f'{where}: the header {columns}; '
             f'{",".join(required)} is expected, the header is {quoted(",".join(header))}'
         )
     for name in header:
@@ -362,7 +407,7 @@ def read_names(directory: PathLike) -> Names:
             else:
                 value = -1
                 with suppress(ValueError):
-                    value = int(identity)
+                    value = int(without_zeros(identity))
                 if not 0 <= value <= MAX_ID:
                     block.fail(index, f'id is {identity!r}, not an integer')
             if name in table or value in table.values():

@@ -11,7 +11,7 @@ from typing import Any
 from ..exposures.decisions import Doubtful, PointDecision
 from ..exposures.names import MAX_ID, Names
 from .access import PathLike
-from .csv_table import Block, Table, read_blocks
+from .csv_table import Block, Table, read_blocks, without_zeros
 
 DOUBTFUL = 'doubtful.csv'  # in a result folder
 LEAVE_OUT = 'leave out'
@@ -63,7 +63,7 @@ def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
             words = ' '.join(decision.replace('_', ' ').lower().split())
             if not words:
                 continue
-            row = {name: cells[index].strip() for name, cells in columns.items()}
+            row = {name: without_zeros(cells[index].strip()) for name, cells in columns.items()}
             new_id = None if words == LEAVE_OUT else _new_id(block, index, row, names)
             first = _number(block, index, row, 'exposure', names.exposures)
             last = first

@@ -44,6 +44,7 @@ from .csv_table import Block, NamedColumn, Table, read_all, read_blocks, write_t
 ANGLE = 'angle_deg'
 CORRECTED_BY = 'corrected_by'  # id of the calibration that corrected the image points
 COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
+NOT_SEEN = 'remove the rows of targets that are not seen'  # advice
 
 
 @dataclass(frozen=True)
@@ -246,7 +247,7 @@ def _parse(block: Block, columns: _Columns) -> _Rows:
             if columns.known is None or not name:
                 check_safe_name(name, f'{block.path}, row {block.lines[names.index(name)]}')
             codes[name] = len(codes)
-    uv = np.column_stack([block.floats('u'), block.floats('v')])
+    uv = np.column_stack([block.floats(name, NOT_SEEN) for name in 'uv'])
     sigma = np.full(len(uv), np.nan)
     if 'sigma' in block:
         sigma = block.floats_or_nan('sigma')

@@ -81,6 +81,12 @@ def write(path, *rows, header='fluoroscope,exposure,last_exposure,target_id,deci
     return path
 
 
+def test_numbers_that_a_spreadsheet_wrote_as_floats_are_read(tmp_path):
+    path = write(tmp_path / 'd.csv', 'a,2.0,4.0,7.0,8.0')
+    (given,) = read_decisions(path, Names())
+    assert (given.first, given.last, given.target_id, given.new_id) == (2, 4, 7, 8)
+
+
 def test_table_is_read_with_names(tmp_path):
     names = Names({'tip': 5, 'base': 6}, {'run 3': 33}, {'cam 1': 'cam_1'})
     path = write(

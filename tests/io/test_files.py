@@ -230,7 +230,10 @@ def test_phantom_exported_from_a_spreadsheet(tmp_path):
         ('5,1,nan,3,0.1', "row 6: y is 'nan', not a finite number"),
         ('5,1,2,inf,0.1', "row 6: z is 'inf', not a finite number"),
         ('5,1,1_0,3,0.1', "row 6: y is '1_0', not a number"),
-        ('5.0,1,2,3,0.1', "row 6: target_id is '5.0', not an integer"),
+        ('5.5,1,2,3,0.1', "row 6: target_id is '5.5', not an integer"),
+        ('5.,1,2,3,0.1', "row 6: target_id is '5.', not an integer"),
+        ('3.0,1,2,3,0.1', 'row 6: target 3 is already given in row 5'),
+        ('5,1,"2,5",3,0.1', "row 6: y is '2,5', not a number: it has a decimal comma; write"),
         ('-5,1,2,3,0.1', "row 6: target_id is '-5', not between 0 and 4294967295"),
         ('99999999999999999999,1,2,3,0.1', 'not between 0 and 4294967295'),
         ('5,1,2,3,0', "row 6: sd is '0', not above 0"),
@@ -254,6 +257,7 @@ def test_phantom_header_encoding_and_number_of_targets(tmp_path):
         return message_of(read_phantom, text_file(tmp_path, 'phantom.csv', text))
 
     assert 'row 1: the header has no column sd' in said('target_id,x,y,z\n1,2,3,4\n')
+    assert 'row 1: the header lacks the columns x, y, z; target_id,' in said('target_id,sd\n1,2\n')
     assert 'the column x twice' in said('target_id,x,y,z,sd,x\n1,2,3,4,5,6\n')
     assert 'no rows' in said('target_id,x,y,z,sd\n')
     assert 'at least 4' in said('target_id,x,y,z,sd\n1,2,3,4,5\n')
@@ -365,6 +369,18 @@ def test_observations_in_any_order_of_rows_and_columns(tmp_path):
     )
 
 
+@pytest.mark.parametrize('known', [None, Names()])
+def test_whole_numbers_that_are_written_as_floats_are_read(tmp_path, known):
+    """As pandas writes a column in which a value was missing."""
+    path = text_file(tmp_path, 'o.csv', OBSERVATIONS + 'a,1.0,7.0,1,2,\na,10.00,7,1,2,\n')
+    if known is None:
+        frames = read_observations_csv(path, SIZE)
+    else:
+        frames, names, _ = read_named_observations(path, SIZE, known)
+        assert not names
+    assert [(f.number, f.target_id.tolist()) for f in frames['a']] == [(1, [7]), (10, [7])]
+
+
 def test_observations_require_the_image_size(tmp_path):
     path = text_file(tmp_path, 'o.csv', OBSERVATIONS + 'a,0,1,2,3,\n')
     assert '--image-size' in message_of(read_observations_csv, path)
@@ -374,7 +390,9 @@ def test_observations_require_the_image_size(tmp_path):
     'row, sentence',
     [
         ('a,0,3,abc,2,', "row 4: u is 'abc', not a number"),
-        ('a,0,3,nan,2,', "row 4: u is 'nan', not a finite number"),
+        ('a,0,3,nan,2,', "row 4: u is 'nan', not a finite number: remove the rows of targets"),
+        ('a,0,3,1,,', "row 4: v is '', not a number: remove the rows of targets that are not"),
+        ('a,1.5,3,1,2,', "row 4: exposure is '1.5', not an integer"),
         ('a,0,3,1,-inf,', "row 4: v is '-inf', not a finite number"),
         ('a,x,3,1,2,', "row 4: exposure is 'x', not an integer"),
         ('a,0,3,1024,2,', 'row 4: the point (1024, 2) is outside the image of 1024 x 960 px'),

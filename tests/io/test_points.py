@@ -555,6 +555,16 @@ def test_frame_specification_of_a_lab_is_read(tmp_path):
         assert content.survey.target_id.tolist() == [1, 2, 3, 4]
         assert content.survey.xyz_mm[0].tolist() == [0, 0, 1.5 * factor]
         assert 'lengths in cm' in content.notes[0]
+    beads = ''.join(f'{row},{name}\n' for row, name in zip(beads.split(), (8, 4, 5, 6)))
+    for header, text in (
+        ('x,y,z', beads),
+        ('x;y;z', beads.replace(',', ';')),
+        ('x;y;z', beads.replace(',', ';').replace('.', ',')),
+    ):
+        path.write_text(f'{header}\n{text}')
+        survey = registry.read(path, FileSettings()).survey
+        assert survey.target_id.tolist() == [4, 5, 6, 8]
+        assert survey.xyz_mm[3].tolist() == [0, 0, 15]
     path.write_text('x y z\n0,0,1.5\n1,0\n')
     assert 'row 3: 2 columns, but a bead has x,y,z' in refused(path)
     path.write_text('x y z\n0,0,1.5,a\n1,0,2,a\n')

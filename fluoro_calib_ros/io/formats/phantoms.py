@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from ...errors import DataError, ErrorsAt, quoted
 from ...exposures.names import MAX_ID, Names, number_names, without_trivial
 from ...exposures.phantom import Phantom
+from ...findings import sentence_of
 from ...limits import read_limits
 from ..access import read_text, write_text
-from ..csv_table import decimal_point, is_number
+from ..csv_table import decimal_comma_advice, decimal_point, is_number, without_zeros
 from .content import UNITS_MM, Content, FileSettings, Format, Sample, Written, from_units, in_units
 from .tables import Row, joined, separator_of, table_of
 
@@ -167,7 +168,8 @@ def _numbers(row: Row, layout: _Layout, names: Sequence[str]) -> list[float]:
     for name in names:
         cell = row.cells[layout.columns[name]]
         if not is_number(cell) or not np.isfinite(float(cell)):
-            row.fail(f'{name} is {quoted(cell)}, not a finite number')
+            cause = f'{name} is {quoted(cell)}, not a finite number'
+            row.fail(sentence_of(cause, decimal_comma_advice(cell)))
         numbers.append(float(cell))
     return numbers
 
@@ -183,7 +185,7 @@ def _ids(rows: Sequence[Row], layout: _Layout) -> dict[str, int]:
     """Return the ids by name, in the order of the rows. Raises DataError for a repeated name."""
     if 'id' not in layout.columns:
         return {str(number): number for number in range(1, len(rows) + 1)}
-    cells = [row.cells[layout.columns['id']] for row in rows]
+    cells = [without_zeros(row.cells[layout.columns['id']]) for row in rows]
     first_rows: dict[str, Row] = {}
     for row, cell in zip(rows, cells):
         if not cell:
@@ -225,7 +227,8 @@ def _is_framespec(sample: Sample) -> bool:
     """Return whether the file begins with the header of a frame specification, then a bead."""
     if len(sample.lines) < 2 or not _FIRST_ROW.fullmatch(sample.lines[0]):
         return False
-    return 3 <= len(re.split(r'[,;\t]', sample.lines[1])) <= 4 and 'target' not in sample.lines[0]
+    header, bead = sample.lines[:2]
+    return 3 <= len(bead.split(separator_of(bead))) <= 4 and 'target' not in header
 
 
 def _read_framespec(path: Path, settings: FileSettings) -> Content:

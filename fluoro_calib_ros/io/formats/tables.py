@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from ...errors import DataError, quoted
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names, without_trivial
+from ...findings import sentence_of
 from ...limits import MAX_ROWS
 from ..access import PathLike, atomic_file, check_rows, read_text
-from ..csv_table import decimal_point
+from ..csv_table import decimal_comma_advice, decimal_point, without_zeros
 from .content import Bodies, Content, FileSettings, Points
 
 MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
@@ -101,13 +102,14 @@ class Row:
             except ValueError:
                 value = math.inf
             if math.isinf(value):
-                self.fail(f'column {column + 1} is {quoted(cell)}, not a number')
+                cause = f'column {column + 1} is {quoted(cell)}, not a number'
+                self.fail(sentence_of(cause, decimal_comma_advice(cell)))
             values.append(value)
         return values
 
     def whole(self, column: int, label: str) -> int:
         """Return a cell as a non-negative integer. Raises DataError."""
-        cell = self.cells[column]
+        cell = without_zeros(self.cells[column])
         if not cell.isascii() or not cell.isdigit():
             self.fail(f'{label} is {quoted(cell)}, not an integer')
         return int(cell)

@@ -257,6 +257,27 @@ def sentences(findings: Iterable[Finding], severity: Severity | None = None) -> 
     ]
 
 
+def summed_up(findings: Iterable[Finding]) -> list[str]:
+    """Return the sentences of findings; of one kind on many exposures only the first.
+
+    It then ends in the numbers of the other exposures. Fluoroscopes are kept apart.
+    """
+    groups: dict[object, list[Finding]] = {}
+    for number, finding in enumerate(findings):
+        place = finding.place
+        is_exposure = len(place.exposures) == 1
+        key = (finding.kind, place.fluoroscopes) if is_exposure else number
+        groups.setdefault(key, []).append(finding)
+    out = []
+    for first, *others in groups.values():
+        if len(others) < MAX_LISTED:
+            out += sentences([first, *others])
+            continue
+        numbers = first_few(finding.place.exposures[0] for finding in others)
+        out.append(f'{first.sentence}; likewise {len(others)} more exposures: {numbers}')
+    return out
+
+
 def sentence_of(*parts: object) -> str:
     """Return place, cause and advice as a sentence, without empty parts."""
     return ': '.join(filter(None, map(str, parts)))
@@ -268,6 +289,11 @@ def first_few(names: Iterable[object], separator: str = ', ') -> str:
     text = separator.join(texts[:MAX_LISTED])
     remaining = len(texts) - MAX_LISTED
     return f'{text} and {remaining} more' if remaining > 0 else text
+
+
+def too_few(count: int, noun: str) -> str:
+    """Return the statement that this number of things is too small; noun in the singular."""
+    return f'{count} {noun} is too few' if count == 1 else f'{count} {noun}s are too few'
 
 
 def _named(noun: str, things: tuple[object, ...]) -> str:

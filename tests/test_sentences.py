@@ -49,7 +49,7 @@ from fluoro_calib_ros.exposures.collector import without_repeats
 from fluoro_calib_ros.exposures.frame import without_strays
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.exposures.stamps import StampTolerance
-from fluoro_calib_ros.findings import Finding, Kind, Place
+from fluoro_calib_ros.findings import Finding, Kind, Place, too_few
 from fluoro_calib_ros.healing.diagnosis import Cause, Change
 from fluoro_calib_ros.images import detection, extraction, lattice, matching
 from fluoro_calib_ros.images.codec import as_grey
@@ -480,7 +480,7 @@ MAKERS = {
     Kind.RIG_MOVED: moved_rig,
     Kind.RIG_NOTE: saved_note,
     Kind.RIG_NOT_ORIENTED: no_orientation,
-    Kind.ORIENTATION: lambda: replace(rig_checks._check(of_rig(), pairs()), limit=-1.0),
+    Kind.ORIENTATION: lambda: replace(rig_checks._check(of_rig(), pairs(), 0.1), limit=-1.0),
     Kind.TAKEN_ON_TRUST: lambda: rig_checks._trusted({'a': (), 'b': ()}, pairs(), 0.2),
     Kind.POSE_AMBIGUOUS: ambiguous,
     Kind.MARKER_FOUND_AGAIN: lambda: doubt_in(Kind.MARKER_FOUND_AGAIN, 7, 3, images=4),
@@ -949,6 +949,14 @@ def test_places_in_a_sentence():
     found = Finding(Kind.POOR_FIT, 'cause', Place(('a',)), 'advice')
     assert found.sentence == str(found) == 'fluoroscope a: cause: advice'
     assert found.at('x.csv').sentence == 'x.csv: fluoroscope a: cause: advice'
+
+
+def test_one_thing_is_in_the_singular():
+    assert too_few(1, 'exposure') == '1 exposure is too few'
+    assert [too_few(n, 'target') for n in (0, 2)] == [f'{n} targets are too few' for n in (0, 2)]
+    with pytest.raises(DataError, match='1 exposure is too few, 3 are needed, 1 more has too few'):
+        few = [replace(frames(1)[0].rows(np.arange(5)), number=9)]
+        measured_network({'a': frames(1) + few}, PHANTOM)
 
 
 def test_an_error_keeps_its_findings_on_its_way():

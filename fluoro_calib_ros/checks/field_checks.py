@@ -21,7 +21,7 @@ from ..estimation.exposure_terms import MIN_POINTS, VARYING
 from ..estimation.options import AUTO
 from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import angles_of
-from ..findings import Kind, Place
+from ..findings import Kind, Place, too_few
 from ..photogrammetry.noise import SURE
 from .calibration_evidence import MIN_VARYING_EXPOSURES, CommonTrend, Evidence, Subject
 from .check import Check, more_exposures, too_little_data
@@ -154,7 +154,7 @@ def check_halves(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     evidence.report_step(f'{"+".join(names)}: two halves')
     fewest = evidence.fewest_exposures(names)
     if fewest < 2 * MIN_EXPOSURES:
-        reason = f'{fewest} exposures are too few for two halves of {MIN_EXPOSURES} or more'
+        reason = f'{too_few(fewest, "exposure")} for two halves of {MIN_EXPOSURES} or more'
         return [too_little_data(Kind.HALVES, name, reason, fewest) for name in names]
     try:
         even = evidence.calibrate(evidence.part(names, lambda i: i % 2 == 0))

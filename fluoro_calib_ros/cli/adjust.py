@@ -89,5 +89,6 @@ def run(arguments: argparse.Namespace) -> bool:
     text = HOLDS if holds else DOES_NOT_HOLD
     verdict = styled_verdict(text, 'pass' if holds else 'fail')
     document = {**written_document(result), 'holds': holds}
-    print_result(arguments, document, f'{summary_table(result).rstrip()}\n\n{verdict}')
+    table = summary_table(result, has_notes=False).rstrip()  # they are already printed
+    print_result(arguments, document, f'{table}\n\n{verdict}')
     return holds

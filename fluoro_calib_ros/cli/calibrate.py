@@ -288,7 +288,7 @@ def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
 
     print_findings(outcome.result.findings, 'implausible: ')
     document = written_document(outcome.result)
-    lines = [summary_table(outcome.result).rstrip()]
+    lines = [summary_table(outcome.result, has_notes=False).rstrip()]
     if outcome.validation is not None:
         report = _report(arguments.out)
         document |= {'validation': validation_document(outcome.validation), 'report': report}

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
 from ..errors import printable
-from ..findings import Finding, Severity
+from ..findings import Finding, Severity, summed_up
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -79,10 +79,15 @@ def print_notes(notes: Iterable[object]) -> None:
 
 
 def print_findings(findings: Iterable[Finding], error: str) -> None:
-    """Print the findings on a calibration on standard error; error: prefix of errors."""
+    """Print the findings on a calibration on standard error; error: prefix of errors.
+
+    Findings of one kind on many exposures become one line.
+    """
     prefixes = {Severity.NOTE: 'not used: ', Severity.WARNING: '', Severity.ERROR: error}
-    for finding in sorted(findings, key=lambda f: (1, 0, 2)[f.severity]):
-        print_note(f'{prefixes[finding.severity]}{finding}')
+    given = list(findings)
+    for severity in (Severity.WARNING, Severity.NOTE, Severity.ERROR):
+        for sentence in summed_up(f for f in given if f.severity is severity):
+            print_note(f'{prefixes[severity]}{sentence}')
 
 
 def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:

@@ -16,7 +16,7 @@ from ..errors import DataError
 from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
-from ..findings import Finding, Kind, Place, Severity
+from ..findings import Finding, Kind, Place, Severity, too_few
 from ..photogrammetry.adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
@@ -457,7 +457,7 @@ def _usable_frames(
             excluded.append(
                 Finding(
                     Kind.FEW_TARGETS,
-                    f'{count} targets are too few, {needed_targets} are needed',
+                    f'{too_few(count, "target")}, {needed_targets} are needed',
                     frame.place,
                     severity=Severity.NOTE,
                     numbers={'targets': count, 'needed': needed_targets},
@@ -473,10 +473,11 @@ def _usable_frames(
 
 def _too_few(name: str, count: int, needed: int, excluded: Sequence[Finding]) -> Finding:
     """Return the finding that a fluoroscope has too few exposures."""
-    remark = f', {len(excluded)} more have too few targets' if excluded else ''
+    has = 'has' if len(excluded) == 1 else 'have'
+    remark = f', {len(excluded)} more {has} too few targets' if excluded else ''
     return Finding(
         Kind.FEW_EXPOSURES,
-        f'{count} exposures are too few, {needed} are needed{remark}',
+        f'{too_few(count, "exposure")}, {needed} are needed{remark}',
         Place((name,)),
         numbers={'exposures': count, 'needed': needed, 'few_targets': len(excluded)},
     )

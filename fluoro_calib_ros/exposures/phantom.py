@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..brief import brief_repr
 from ..errors import DataError
-from ..findings import Kind
+from ..findings import Kind, too_few
 
 MIN_TARGETS = 4
 # Possible extent of what a fluoroscope sees: from a grid before the detector of a specimen scanner
@@ -99,7 +99,7 @@ def _validate(ids: NDArray[np.int64], xyz: NDArray[np.float64], sd: NDArray[np.f
         )
     if len(ids) < MIN_TARGETS:
         raise DataError(
-            f'phantom: {len(ids)} targets are too few, at least {MIN_TARGETS} are needed'
+            f'phantom: {too_few(len(ids), "target")}, at least {MIN_TARGETS} are needed'
         )
     for name, valid in (
         ('coordinate', np.isfinite(xyz).all(axis=1)),

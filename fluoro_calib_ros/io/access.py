@@ -192,6 +192,8 @@ def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
         sync_folder(folder)
     except OSError as error:
         _remove(temporary)
+        if isinstance(error, FileNotFoundError) and not os.path.isdir(folder):
+            raise DataError(f'{path}: cannot be written, there is no folder {folder}') from None
         raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
     except BaseException:
         _remove(temporary)

@@ -33,7 +33,7 @@ from ..estimation.survey import MeasuredDistance, SurveyedBeads, surveyed_beads
 from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import Frames
 from ..exposures.phantom import EXACT_SD_MM, MIN_TARGETS, Phantom
-from ..findings import Finding, Kind, Severity
+from ..findings import Finding, Kind, Severity, too_few
 from .calibration import run_calibration
 
 
@@ -212,7 +212,7 @@ def _halves(
     fewest = min(len(fluoroscope.exposures) for fluoroscope in result.fluoroscopes.values())
     if fewest < 2 * MIN_EXPOSURES:
         return halves_not_compared(
-            f'{fewest} exposures are too few for two halves of {MIN_EXPOSURES} or more'
+            f'{too_few(fewest, "exposure")} for two halves of {MIN_EXPOSURES} or more'
         )
     # Start from the better coordinates found so far. The scale is not compared, so exclude its
     # uncertainty.

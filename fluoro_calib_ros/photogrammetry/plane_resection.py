@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
+from ..findings import too_few
 from .noise import Noise
 from .resection import (
     DLT_ITERATIONS,
@@ -105,7 +106,7 @@ def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArr
     there are too few targets, or their image points lie on a line.
     """
     if len(xy) < MIN_TARGETS:
-        raise DataError(f'{len(xy)} targets are too few for a resection, {MIN_TARGETS} are needed')
+        raise DataError(f'{too_few(len(xy), "target")} for a resection, {MIN_TARGETS} are needed')
     spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_FLATNESS * spread[0]:
         raise DataError('all image points are collinear or coincide')

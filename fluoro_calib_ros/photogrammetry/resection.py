@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from ..errors import DataError
+from ..findings import too_few
 from .collinearity import project, project_with_jacobian
 from .noise import Noise
 from .rotations import matrix_from_vector
@@ -184,9 +185,7 @@ def robust_dlt(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.
     targets, or they lie in one plane.
     """
     if len(xyz) < MIN_TARGETS:
-        raise DataError(
-            f'{len(xyz)} targets are too few for a resection, {MIN_TARGETS} are needed'
-        )
+        raise DataError(f'{too_few(len(xyz), "target")} for a resection, {MIN_TARGETS} are needed')
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if not extent[0] > MIN_EXTENT_MM:
         raise DataError('all targets coincide')

@@ -18,7 +18,7 @@ from ..correction.angle_field import AngleField
 from ..correction.base import CorrectionModel
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.result import CalibrationResult, FluoroscopeResult
-from ..findings import Severity, sentences
+from ..findings import Severity, sentences, summed_up
 from ..photogrammetry.rig_orientation import RigOrientation
 
 # Widths of columns, in characters.
@@ -27,10 +27,15 @@ COLUMN_WIDTH = 20  # for the values of a fluoroscope
 CELLS = 50  # points across the image at which the calibrated area is sampled: in steps of 2 %
 
 
-def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | None = None) -> str:
+def summary_table(
+    result: CalibrationResult,
+    latency_ms: Mapping[str, float] | None = None,
+    has_notes: bool = True,
+) -> str:
     """Summarise a calibration in at most 100 columns of text, one table column a fluoroscope.
 
     latency_ms: latency of the correction, p50, p99 and max [ms], and the number of frames.
+    has_notes: whether to list what was not used.
     """
     names = list(result.fluoroscopes)
     per_block = (TERMINAL_WIDTH - LABEL_WIDTH) // COLUMN_WIDTH
@@ -47,7 +52,8 @@ def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | N
     text = '\n\n'.join(blocks)
     targets = len(result.targets.target_id)
     text += f'\n\nAll fluoroscopes: {targets} targets, {result.seconds:.1f} s'
-    for sentence in sentences(result.findings, Severity.NOTE):
+    notes = [f for f in result.findings if has_notes and f.severity is Severity.NOTE]
+    for sentence in summed_up(notes):
         text += '\n' + textwrap.fill(
             f'Not used: {sentence}', TERMINAL_WIDTH, subsequent_indent='    '
         )

@@ -26,7 +26,7 @@ from fluoro_calib_ros.cli.survey import _distances, distance
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.rounds import Round
 from fluoro_calib_ros.exposures.names import Names
-from fluoro_calib_ros.findings import Finding, Kind, Severity
+from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
 from fluoro_calib_ros.healing.diagnosis import Cause
 from fluoro_calib_ros.io.bags.salvage import BagReport, Damage, TopicReport
 from fluoro_calib_ros.io.phantom import read_phantom
@@ -280,6 +280,27 @@ def test_findings_are_printed_warnings_first_and_errors_last(capsys):
     assert capsys.readouterr().err == 'extracting\n'
     output.print_unpaired(Path('s'), {'a': 0})
     assert capsys.readouterr().err == ''
+
+
+def test_findings_of_one_kind_on_many_exposures_are_one_line(capsys):
+    def on_exposures(numbers, fluoroscope):
+        return [
+            Finding(
+                Kind.STRAY_POINTS,
+                f'{n} points',
+                Place((fluoroscope,), (n,)),
+                severity=Severity.NOTE,
+            )
+            for n in numbers
+        ]
+
+    output.print_findings([*on_exposures(range(1, 5), 'a'), *on_exposures(range(8, 30), 'b')], '')
+    *of_a, of_b = capsys.readouterr().err.splitlines()
+    assert [line.split(': ')[1] for line in of_a] == [
+        f'fluoroscope a, exposure {n}' for n in range(1, 5)
+    ]
+    assert of_b.startswith('not used: fluoroscope b, exposure 8: 8 points')
+    assert of_b.endswith('21 more exposures: 9, 10, 11, 12, 13 and 16 more')
 
 
 def test_steps_and_rounds_are_shown_on_a_terminal(monkeypatch):

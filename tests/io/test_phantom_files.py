@@ -79,7 +79,7 @@ def test_the_columns_of_a_header_may_have_any_order(tmp_path):
     [
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0,0\n1,0,9,0\n3,0,0,9\n', "row 4: bead '1' is already"),
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,nan,0,0\n3,0,9,0\n', 'row 3: x is'),
-        ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,"1,5",0,0\n3,0,9,0\n', 'row 3: x is \'1,5\', not a'),
+        ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,"1,5",0,0\n3,0,9,0\n', "row 3: x is '1,5', not a"),
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,"1,5",0,0\n3,0,9,0\n', 'with semicolons between the'),
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0,0\n1.0,0,9,0\n', "row 4: bead '1' is already"),
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0\n3,0,9,0\n', 'row 3: 3 columns'),

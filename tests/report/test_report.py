@@ -197,6 +197,13 @@ def test_summary_holds_the_numbers(job):
     assert 'Latency' not in summary_table(job)
 
 
+def test_summary_has_what_was_not_used_unless_it_is_printed_elsewhere(job):
+    note = Finding(Kind.STRAY_POINTS, 'why', severity=Severity.NOTE)
+    noted = dataclasses.replace(job, findings=(note,))
+    assert summary_table(noted).splitlines()[-1] == 'Not used: why'
+    assert summary_table(noted, has_notes=False) == summary_table(job, has_notes=False)
+
+
 def test_sd_of_the_correction_in_the_summary_is_that_at_the_angles_of_the_exposures(job):
     turning = rigs.turning(job.calibrations['a'])
     text = summary_table(dataclasses.replace(job, calibrations={**job.calibrations, 'a': turning}))

@@ -345,7 +345,8 @@ def rig_findings(
     side = max(max(calibration.image_size) for calibration in calibrations.values())
     corrections = {name: _correction_sd(frames[name], calibrations[name]) for name in names}
     correction_px = tuple(
-        float(np.hypot(*(corrections[name] for name in pairs.fluoroscopes))) for pairs in scatter
+        float(np.linalg.norm([corrections[name] for name in pairs.fluoroscopes]))
+        for pairs in scatter
     )
     tested = [doubtful(pairs, side, noise, sd) for pairs, sd in zip(scatter, correction_px)]
     refused = tuple(doubt for usable, doubts in tested for doubt in doubts if not usable)

@@ -261,11 +261,11 @@ class BodiesOutcome:
             }
         joints = {}
         for motion in self.joints:
-            known = np.isfinite(motion.angles).all(axis=1)
+            is_known = np.isfinite(motion.angles).all(axis=1)
             span = sd = np.full(3, np.nan)
-            if known.any():
-                span = np.degrees(np.ptp(motion.angles[known], axis=0))
-                sd = np.degrees(np.nanmedian(motion.sd[known, :3], axis=0))
+            if is_known.any():
+                span = np.degrees(np.ptp(motion.angles[is_known], axis=0))
+                sd = np.degrees(np.nanmedian(motion.sd[is_known, :3], axis=0))
             joints[motion.joint.name] = {
                 name: {'range_deg': float(a), 'sd_deg': float(s)}
                 for name, a, s in zip(motion.angle_names, span, sd)

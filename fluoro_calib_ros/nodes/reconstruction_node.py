@@ -39,7 +39,7 @@ from .reconstruction_output import (
     ReconstructionState,
     statuses_of,
 )
-from .retractions import BodyRetractions, PointRetractions
+from .retractions import PointRetractions
 from .rig_input import BodyFollower, BodyParameters, RigInput, read_body_files
 from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
 from .runtime.lifecycle import Stream, StreamNode, stream_faults
@@ -211,7 +211,7 @@ class ReconstructionNode(StreamNode):
             self._follower = BodyFollower(bodies, joints, self._body_parameters.body_lag)
             names = [body.name for body in bodies]
             self._bodies_output = BodiesOutput(self, names, bool(joints), self._settings.rig_frame)
-            self._retractions.bodies = BodyRetractions(self._bodies_output.publish_own)
+            self._retractions.bodies = self._bodies_output.retractions
 
     def _create_inputs(self) -> None:
         for topic, callback in (
@@ -242,13 +242,15 @@ class ReconstructionNode(StreamNode):
             )
 
     def deactivate(self) -> None:
-        """Stop the stream readers, and publish the exposures that wait for a further view."""
+        """Stop the stream readers, and publish the exposures that wait for later frames."""
         super().deactivate()
         for exposure in self._pairer.flush():
             try:
                 self._reconstruct(exposure)
             except Exception as error:  # only this exposure is lost
                 self._refusals.fail(VIEWS, error)
+        for bodies in () if self._follower is None else self._follower.flush():
+            self._bodies_output.publish(bodies)
 
     # -- the rig
 
@@ -328,7 +330,6 @@ class ReconstructionNode(StreamNode):
             number = content.frame_number
             for bodies in self._follower.add(intersected, widened, number, content.stamp_ns):
                 self._bodies_output.publish(bodies)
-                self._retractions.bodies.note(bodies)
         if rig.watch is not None:
             watch_exposure(rig.watch, first_view.stamp_ns, intersected)
         return True

@@ -43,6 +43,7 @@ from .messages.points import (
     mocap_markers,
     point_cloud,
 )
+from .retractions import BodyRetractions
 from .rig_input import BodiesState, BodyFollower, RigInput
 from .runtime.diagnostics import (
     OK,
@@ -167,6 +168,7 @@ class BodiesOutput:
         self._joint_states = (
             output(JointState, 'reconstruction/joint_states') if has_joints else None
         )
+        self.retractions = BodyRetractions(self.publish_own)  #: of the published poses
 
     def publish(self, content: BodiesContent) -> None:
         """Publish an exposure; standard message types only while they have subscribers."""
@@ -184,6 +186,7 @@ class BodiesOutput:
                 publisher.publish(make(content, message))
         if self._joint_states is not None and self._joint_states.get_subscription_count():
             self._joint_states.publish(joint_state(content))
+        self.retractions.note(content)
 
     def publish_own(self, content: BodiesContent) -> BodyPoses:
         """Publish the messages that have a status field; return that of the poses."""

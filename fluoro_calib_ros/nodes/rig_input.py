@@ -306,7 +306,7 @@ class BodyFollower:
         begins_anew = order is Order.RESTART
         out = []
         if self._tracker is None or begins_anew or not self._is_same(rig):
-            out = self._flushed()
+            out = self.flush()
             self._tracker = BodyTracker(
                 rig.orientation, self.bodies, rig.intersector.reject or np.inf, self._lag
             )
@@ -332,11 +332,12 @@ class BodyFollower:
         self.state: BodiesState | None = None  #: None before the first exposure
         self._squares = np.zeros((2, len(self.bodies)))  # chi-squared and expectation
 
-    def _flushed(self) -> list[BodiesContent]:
-        """Return the contents of exposures that wait for later ones, which will not come."""
-        if self._tracker is None:
+    def flush(self) -> list[BodiesContent]:
+        """Return the contents of exposures that wait for later ones; the next is a new start."""
+        tracker, self._tracker = self._tracker, None
+        if tracker is None:
             return []
-        return [self._content(exposure) for exposure in self._tracker.flush()]
+        return [self._content(exposure) for exposure in tracker.flush()]
 
     def _content(self, tracked: TrackedExposure) -> BodiesContent:
         """Return poses and joints of an exposure, and update the state."""

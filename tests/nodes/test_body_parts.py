@@ -283,6 +283,15 @@ def test_new_tracker_first_gives_what_waits(change):
     assert found[0].frame_number == row + 1 and found[0].orientation_id == f'rig-{number}'
 
 
+def test_exposures_that_wait_at_the_end_are_returned_and_the_next_begins_anew():
+    follower = BodyFollower(BODIES, (), lag=3)
+    assert [content.frame_number for content in follow(follower, range(10))] == [*range(1, 8)]
+    assert [content.frame_number for content in follower.flush()] == [8, 9, 10]
+    assert not follower.flush()
+    (content,) = follow(follower, range(20, 24))
+    assert content.frame_number == 21
+
+
 def test_angles_of_a_joint_are_those_from_its_neutral_trial_on():
     """The axes of the tibia are 0.3 rad off; a restarted recording has its own neutral trial."""
     off = AnatomicalFrame(Rotation.from_euler('x', 0.3).as_matrix(), np.zeros(3))

@@ -6,6 +6,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import rigs
 from builtin_interfaces.msg import Time
@@ -20,6 +21,8 @@ from ros_graph import NAMES, Graph, value_of
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
+from fluoro_calib_ros.bodies.body import Body
+from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.calibration import save_orientation
 from fluoro_calib_ros.nodes.correction_node import CorrectionNode
 from fluoro_calib_ros.nodes.image_node import ImageNode
@@ -27,6 +30,7 @@ from fluoro_calib_ros.nodes.reconstruction_node import ReconstructionNode
 from fluoro_calib_ros.nodes.runtime.topics import observations_qos
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
+MARKERS = np.array([[0, 0, 0], [30, 5, -4], [-6, 28, 9], [4, -8, 31.0]])
 NODES = ('correction_node', 'reconstruction_node', 'image_node')
 
 
@@ -184,13 +188,15 @@ def test_failed_transition_gives_the_reason_and_changes_nothing(graph):
     assert node.end() == 0 and 'Traceback' not in node.log
 
 
-def test_deactivated_node_publishes_exposures_that_wait_for_a_view(graph):
-    """The third fluoroscope is silent, so that it is waited for."""
+def test_deactivated_node_publishes_exposures_that_wait(graph):
+    """Points wait for a view of the third fluoroscope, and poses for two later exposures."""
     client = graph.client
     ids = {name: SimpleNamespace(calibration_id=f'{name}-1') for name in 'abc'}
     orientation = rigs.true_orientation(virtual_rig(1, names=tuple(ids)).fluoroscopes, ids)
-    path = save_orientation(graph.directory, orientation)
+    body = Body('femur', np.arange(1, 5), MARKERS, np.full(4, 0.02))
+    write_bodies(graph.directory / 'bodies.csv', [body])
     points = client.listen('reconstruction/points_with_covariance')
+    poses = client.listen('reconstruction/body_poses')
     outputs = [
         client.create_publisher(
             CorrectedObservations, f'{name}/corrected_observations', observations_qos()
@@ -198,11 +204,17 @@ def test_deactivated_node_publishes_exposures_that_wait_for_a_view(graph):
         for name in 'ab'
     ]
     expect(client, 'reconstruction_node')
-    graph.start('reconstruction_node', {'fluoroscopes': '[a, b, c]', 'orientation_file': path})
+    parameters = {
+        'fluoroscopes': '[a, b, c]',
+        'orientation_file': save_orientation(graph.directory, orientation),
+        'bodies': graph.directory / 'bodies.csv',
+        'body_lag': 2,
+    }
+    graph.start('reconstruction_node', parameters)
     client.wait_until(lambda: all(out.get_subscription_count() for out in outputs))
     for number in range(1, 6):
-        for output, calibration_id in zip(outputs, orientation.calibration_ids):
-            output.publish(corrected(number, calibration_id))
+        for view, output in enumerate(outputs):
+            output.publish(corrected(number, orientation, view))
     status = client.wait_for_diagnostics(
         'reconstruction_node',
         lambda s: all(value_of(s, f'frames received of {name}') == '5' for name in 'ab'),
@@ -210,22 +222,25 @@ def test_deactivated_node_publishes_exposures_that_wait_for_a_view(graph):
     )
     assert value_of(status, 'exposures') == '0' and not points
     assert change(client, 'reconstruction_node', Transition.TRANSITION_DEACTIVATE)
-    client.wait_until(lambda: len(points) == 5, what='the points')
-    assert [message.frame_number for message in points] == [1, 2, 3, 4, 5]
+    client.wait_until(lambda: len(points) == len(poses) == 5, what='points and poses')
+    for messages in (points, poses):
+        assert [message.frame_number for message in messages] == [1, 2, 3, 4, 5]
 
 
-def corrected(number, calibration_id):
-    """Return a message with one target in the middle of the image."""
+def corrected(number, orientation, view):
+    """Return the message of a view of a body at the origin."""
+    xp, yp, c = orientation.interior[view]
+    x = (MARKERS - orientation.position_mm[view]) @ orientation.rotation[view].T
     return CorrectedObservations(
-        header=Header(stamp=Time(sec=number)),
+        header=Header(stamp=Time(sec=1, nanosec=4_000_000 * number)),
         frame_number=number,
-        calibration_id=calibration_id,
-        target_id=[7],
-        u=[512.0],
-        v=[512.0],
-        sigma=[0.3],
-        correction_sd=[0.1],
-        status=bytes(1),
+        calibration_id=orientation.calibration_ids[view],
+        target_id=[1, 2, 3, 4],
+        u=xp + c * x[:, 0] / x[:, 2],
+        v=yp + c * x[:, 1] / x[:, 2],
+        sigma=[0.3] * 4,
+        correction_sd=[0.1] * 4,
+        status=bytes(4),
     )
 
 

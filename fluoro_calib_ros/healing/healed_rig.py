@@ -177,7 +177,9 @@ def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tup
     for f in range(len(adjustment.functions)):
         prior = prior.widened(diagnostician.sd_of(Change(Cause.DISTORTION, f)))
     covariance = adjustment.covariance_at(diagnosis.observed, prior, diagnosis.solution)
-    places = adjustment.places_at(diagnosis.solution, FITS)
+    solution = diagnosis.solution
+    fits = solution.poses.known & ~(solution.inliers_of_pose < FITS)
+    places = adjustment.places_at(replace(solution, poses=replace(solution.poses, known=fits)))
     errors, by_noise = drift_errors(adjustment, covariance, places)
     variance = diagnosis.observed.variance[diagnosis.observed.seen].mean()
     return float(np.sqrt(3) * errors.place_mm), by_noise * float(np.sqrt(variance))

@@ -332,15 +332,11 @@ class RigAdjustment:
         whitened = np.eye(root.shape[1]) + root.T @ normal @ root
         return np.asarray(root @ np.linalg.solve(whitened, root.T))
 
-    def places_at(self, solution: RigSolution, min_inliers: float) -> NDArray[np.float64]:
-        """Return places (n, 3) [mm] of all markers in the exposures that show their bodies.
-
-        Poses with a smaller share of inliers do not count.
-        """
+    def places_at(self, solution: RigSolution) -> NDArray[np.float64]:
+        """Return places (n, 3) [mm] of all markers in the exposures that show their bodies."""
         poses = solution.poses
         xyz = self.shapes_at(solution.values) @ np.swapaxes(poses.rotation, 2, 3)
-        fits = poses.known & (solution.inliers_of_pose >= min_inliers)
-        known = fits[..., None] & (self.target_id >= 0)
+        known = poses.known[..., None] & (self.target_id >= 0)
         return np.asarray((xyz + poses.centre_mm[:, :, None])[known])
 
     # -- the solution

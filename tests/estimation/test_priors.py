@@ -350,7 +350,7 @@ def test_windows_overlap_by_half(size):
     assert len(nodes) == NODES * round(size[1] / spacing)
     np.testing.assert_allclose(nodes.min(axis=0), spacing / 2)
     np.testing.assert_allclose(nodes.max(axis=0), np.array(size) - spacing / 2)
-    windows = _windows(size, nodes)
+    windows = _windows(size)
     assert len(windows) == (2 * WINDOWS - 1) * (2 * WINDOWS * size[1] // size[0] - 1)
     width = NODES // WINDOWS
     for rows in windows:

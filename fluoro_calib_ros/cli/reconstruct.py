@@ -138,9 +138,8 @@ def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> Non
         'orientation': orientation_document(outcome.orientation),
     }
     by_status = ', '.join(f'{count} {name}' for name, count in counts.items() if count)
-    lines = [
-        f'{total} points of {len(outcome.frames)} frames written to {arguments.out}: {by_status}'
-    ]
+    frames = '1 frame' if len(outcome.frames) == 1 else f'{len(outcome.frames)} frames'
+    lines = [f'{total} points of {frames} written to {arguments.out}: {by_status}']
     if outcome.incomplete:
         lines.append(
             f'{outcome.incomplete} of the frames without all fluoroscopes ({", ".join(names)})'

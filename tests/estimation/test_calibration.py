@@ -518,7 +518,7 @@ def shuffled_ids(frame, seed=4):
         (lambda f: [], 'fluoroscope a: 0 exposures are too few'),
         (
             lambda f: f[:2] + [cut(f[2], 11)],
-            'fluoroscope a: 2 exposures are too few, 3 are needed, 1 more have too few',
+            'fluoroscope a: 2 exposures are too few, 3 are needed, 1 more has too few',
         ),
         (one_pose, 'fluoroscope a: all 5 exposures show the phantom in one pose'),
         (

@@ -10,7 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
-from fluoro_calib_msgs.srv import Calibrate, LoadCalibration, Orient
+from fluoro_calib_msgs.srv import Calibrate, Orient
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from ros_graph import entry_point, value_of
 
 from fluoro_calib_ros.exposures.frame import Frame
@@ -100,7 +102,10 @@ def calibrated(graph, of_rig):
 
 
 def restart_drift_watch(graph, node, markers, points):
-    """Restart the drift watch by a new orientation; return its DiagnosticStatus."""
+    """Restart the drift watch by one of its options; return its DiagnosticStatus.
+
+    The same orientation, received again, would not restart it.
+    """
     client = graph.client
     key = 'reconstruction_node: reconstruction'
     for number in range(2000, NUMBER):
@@ -112,11 +117,16 @@ def restart_drift_watch(graph, node, markers, points):
         status = client.statuses.get('reconstruction_node: drift')
         if status is not None and value_of(status, 'observations') and max(points[-1].rays) == 3:
             break
-    count = node.log.count('orientation rig-')
-    assert client.call(LoadCalibration, 'load_calibration').success
-    client.wait_until(
-        lambda: node.log.count('orientation rig-') > count, what='the orientation once more'
-    )
+    client.expect(SetParameters, 'reconstruction_node/set_parameters')
+    client.wait_until_known_to('reconstruction_node')
+    for hours in (1001.0, 1000.0):  # and back to the default, as offline
+        parameter = Parameter('drift_error_interval', value=hours).to_parameter_msg()
+        answer = client.call(
+            SetParameters, 'reconstruction_node/set_parameters', parameters=[parameter]
+        )
+        assert answer.results[0].successful
+    text = 'the drift watch starts anew'
+    client.wait_until(lambda: node.log.count(text) == 2, what='a new watch')
     client.statuses.pop(key)
     return client.wait_until(lambda: client.statuses.get(key), what='fresh counts')
 

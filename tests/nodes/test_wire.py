@@ -217,6 +217,7 @@ def test_points_are_encoded_once_for_all_forms(monkeypatch):
 
     monkeypatch.setattr(reconstruction_output, 'encode_reconstructed_points', encode)
     content = points_content(5, 'rig', ('a-1', 'b-2'))
+    content.points.covariance[:] = np.eye(3)
     output = reconstruction_output.PointsOutput(SimpleNamespace(create_output=create_output))
     output.publish(content, sigmas=10.0, rate_hz=30.0)
     assert len(encoded) == 1 and {'points_with_covariance', 'points', 'markers'} <= set(published)

@@ -20,11 +20,11 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.result import CalibrationResult, FluoroscopeResult
 from ..findings import Severity, sentences, summed_up
 from ..photogrammetry.rig_orientation import RigOrientation
+from .rig_geometry import uncalibrated_share
 
 # Widths of columns, in characters.
 LABEL_WIDTH = 36
 COLUMN_WIDTH = 20  # for the values of a fluoroscope
-CELLS = 50  # points across the image at which the calibrated area is sampled: in steps of 2 %
 
 
 def summary_table(
@@ -90,7 +90,7 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         **_interior_rows(figures),
         'noise of an image coordinate [px]': _noise_text(calibration),
         'median sd of the correction [px]': number_text(_median_sd(calibration)),
-        'calibrated part of the image [%]': f'{100 * _calibrated_part(calibration):.0f}',
+        'image that is not calibrated [%]': number_text(100 * uncalibrated_share(calibration), 1),
         **_angle_rows(calibration.angle_field),
         'calibration [s]': number_text(calibration.seconds, 1),
     }
@@ -107,12 +107,6 @@ def _median_sd(calibration: FluoroscopeCalibration) -> float:
         return float(np.median(sd))
     squares = [sd**2 + field.change(uv, angle)[1] for angle in field.angles.tolist()]
     return float(np.sqrt(np.maximum(np.median(squares), 0)))
-
-
-def _calibrated_part(calibration: FluoroscopeCalibration) -> float:
-    """Return the part of the image in which points are not outside the calibrated area."""
-    cells = (np.indices((CELLS, CELLS)).reshape(2, -1).T + 0.5) / CELLS
-    return 1 - float(np.mean(calibration.model.outside(cells * calibration.image_size)))
 
 
 def _noise_text(calibration: FluoroscopeCalibration) -> str:

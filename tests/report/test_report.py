@@ -21,6 +21,7 @@ from fluoro_calib_ros.report import report_figures
 from fluoro_calib_ros.report.figures import STYLE
 from fluoro_calib_ros.report.report_figures import relative_costs, write_figures
 from fluoro_calib_ros.report.residuals import normalised_residuals
+from fluoro_calib_ros.report.rig_geometry import uncalibrated_share
 from fluoro_calib_ros.report.tables import markdown_table, summary_table
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
@@ -193,6 +194,8 @@ def test_summary_holds_the_numbers(job):
     assert float(line['median sd of the correction [px]'][0]) == pytest.approx(
         np.median(model.evaluate(model.train_uv).sd), abs=5e-4
     )
+    shares = [100 * uncalibrated_share(job.calibrations[name]) for name in 'ab']
+    assert line['image that is not calibrated [%]'] == [f'{share:.1f}' for share in shares]
     assert 'median 0.123 ms, 99 % below 0.5 ms, largest 2.25 ms (480 frames)' in text
     assert 'Latency' not in summary_table(job)
 

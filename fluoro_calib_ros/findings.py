@@ -143,6 +143,7 @@ class Kind(str, Enum):
     BODY_MIRRORED = 'body_mirrored'
     BODY_NOT_RIGID = 'body_not_rigid'
     BODY_ON_A_LINE = 'body_on_a_line'
+    BODY_SCALED = 'body_scaled'
     BODY_UNSEEN = 'body_unseen'
     MARKER_LOOSE = 'marker_loose'
     MARKER_MIGRATED = 'marker_migrated'

@@ -523,6 +523,7 @@ MAKERS = {
     Kind.BODY_MIRRORED: lambda: shape(lambda given: given * [-1, 1, 1]),
     Kind.BODY_NOT_RIGID: lambda: _stability(_body('femur'), 50.0, 0.5)[0],
     Kind.BODY_ON_A_LINE: lambda: _stability(_body('femur'), 150.0, 0.1)[0],
+    Kind.BODY_SCALED: lambda: shape(lambda given: 1.03 * given),
     Kind.BODY_UNSEEN: lambda: _unseen(_body('femur')),
     Kind.MARKER_LOOSE: lambda: shape(moves=0.5),
     Kind.MARKER_MIGRATED: lambda: shape(lambda given: given + np.eye(5, 3)),
@@ -865,6 +866,10 @@ SENTENCES = {
     Kind.BODY_ON_A_LINE: (
         'body femur: its markers lie nearly on a line (condition number # per m, at most # by '
         'ISO #): the rotation about this line is poorly determined'
+    ),
+    Kind.BODY_SCALED: (
+        'body femur: distances between its markers in space are # times those of its '
+        'coordinates: check the voxel size of the CT, and the scale of the phantom'
     ),
     Kind.BODY_UNSEEN: (
         'body femur: no exposure has three of its markers in space: its shape is not estimated'

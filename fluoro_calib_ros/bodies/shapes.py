@@ -47,8 +47,9 @@ FALSE_SHARE = 0.05
 MAX_CONDITION = 120.0
 MAX_MEAN_ERROR_MM = 0.35
 REJECT_TAIL = 2 * float(ndtr(-CERTAIN))
+MIN_SD_MM = 1e-3  # a CT measurement that is stated as exact
 REGULAR = 1e-10  # share of a normal matrix' largest element that is added to its diagonal
-_MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
+_WRONG_BY_CT = (Kind.BODY_SCALED, Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
 
 
 @dataclass(frozen=True)
@@ -159,16 +160,9 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
         adjustment = _adjust(body, places, start)
     known = np.isfinite(adjustment.xyz).all(axis=1)
     findings = _contradictions(body, places, adjustment)
-    moved_markers = [
-        marker
-        for finding in findings
-        if finding.kind in _MOVED
-        for marker in finding.place.target_id
-    ]
-    if moved_markers:  # their CT coordinates are not observations of these markers
-        sd = np.where(np.isin(body.target_id, moved_markers), np.inf, body.sd_mm)
-        without_ct = replace(body, sd_mm=sd)
-        adjustment = _adjust(without_ct, places, _start(without_ct, places) or start)
+    if any(finding.kind in _WRONG_BY_CT for finding in findings):
+        corrected = _with_true_ct(body, findings)
+        adjustment = _adjust(corrected, places, _start(corrected, places) or start)
     shape = adjustment.xyz
     frame, relative = _datum(shape[known], adjustment.covariance)
     sd = np.full(len(shape), np.inf)
@@ -184,6 +178,18 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
         exposures=adjustment.exposures,
         findings=tuple(findings),
     )
+
+
+def _with_true_ct(body: Body, findings: Sequence[Finding]) -> Body:
+    """Return a body at the scale of space, without CT coordinates that belong to other places."""
+    factor = 1.0
+    sd = body.sd_mm
+    for finding in findings:
+        if finding.kind == Kind.BODY_SCALED:
+            factor = finding.numbers['factor']
+        elif finding.kind in _WRONG_BY_CT:
+            sd = np.where(np.isin(body.target_id, finding.place.target_id), np.inf, sd)
+    return replace(body, xyz_mm=factor * body.xyz_mm, sd_mm=sd)
 
 
 def learned_shape(
@@ -561,7 +567,10 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
     findings = []
     known = body.known & np.isfinite(adjustment.xyz).all(axis=1) & np.isfinite(body.sd_mm)
     if np.count_nonzero(known) >= 4:
-        findings += _migrated(body, adjustment, known)
+        rows = np.flatnonzero(known)
+        findings += _wrong_as_a_whole(body, rows, adjustment.xyz[rows]) or _migrated(
+            body, rows, adjustment.xyz[rows]
+        )
     test = adjustment.test
     typical = float(np.nanmedian(test)) if np.isfinite(test).any() else 1.0
     limit = _limit_of_ratio(places)
@@ -608,26 +617,38 @@ def _limit_of_ratio(places: BodyPlaces) -> float:
     return float(chdtri(freedom, REJECT_TAIL) / freedom)
 
 
-def _migrated(body: Body, adjustment: _Adjustment, known: NDArray[np.bool_]) -> list[Finding]:
+def _wrong_as_a_whole(
+    body: Body, rows: NDArray[np.int64], estimated: NDArray[np.float64]
+) -> list[Finding]:
+    """Return what would make all CT coordinates fit: another scale, or two exchanged markers."""
+    given = body.xyz_mm[rows]
+    sd = np.maximum(body.sd_mm[rows], MIN_SD_MM)
+    if _misfit(given, estimated, sd) <= 1:
+        return []
+    factor = _scale(given, estimated, sd)
+    if factor is not None:
+        cause = (
+            f'distances between its markers in space are {factor:.4f} times those of its '
+            'coordinates: check the voxel size of the CT, and the scale of the phantom'
+        )
+        return [Finding(Kind.BODY_SCALED, cause, place=_place(body), numbers={'factor': factor})]
+    pair = _exchanged(given, estimated, sd)
+    if pair is None:
+        return []
+    markers = [int(body.target_id[rows[k]]) for k in pair]
+    distance = float(np.linalg.norm(given[pair[0]] - given[pair[1]]))
+    cause = f'markers {markers[0]} and {markers[1]} are exchanged in CT or in the images'
+    numbers = {'distance_mm': distance}
+    return [Finding(Kind.MARKERS_EXCHANGED, cause, place=_place(body, markers), numbers=numbers)]
+
+
+def _migrated(
+    body: Body, rows: NDArray[np.int64], estimated: NDArray[np.float64]
+) -> list[Finding]:
     """Compare the shape in the images with that of CT, marker by marker."""
-    rows = np.flatnonzero(known)
     limit = float(chdtri(3, REJECT_TAIL))
     given = body.xyz_mm[rows]
-    sd = np.maximum(body.sd_mm[rows], 1e-3)
-    estimated = adjustment.xyz[rows]
-    pair = _exchanged(given, estimated, sd)
-    if pair is not None:
-        markers = [int(body.target_id[rows[k]]) for k in pair]
-        distance = float(np.linalg.norm(given[pair[0]] - given[pair[1]]))
-        cause = f'markers {markers[0]} and {markers[1]} are exchanged in CT or in the images'
-        return [
-            Finding(
-                Kind.MARKERS_EXCHANGED,
-                cause,
-                place=_place(body, markers),
-                numbers={'distance_mm': distance},
-            )
-        ]
+    sd = np.maximum(body.sd_mm[rows], MIN_SD_MM)
     out: list[int] = []
     while len(rows) - len(out) >= 4:
         kept = [k for k in range(len(rows)) if k not in out]
@@ -687,12 +708,31 @@ def _misfit(
     return float(np.sum(deviation**2) / chdtri(3 * len(ct) - POSE_SIZE, REJECT_TAIL))
 
 
+def _scale(
+    ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
+) -> float | None:
+    """Return the factor of CT coordinates that makes them fit, or None.
+
+    None, too, if they fit without a single marker, which may have migrated. Least squares; Horn,
+    "Closed-form solution of absolute orientation", J. Opt. Soc. Am. A 4, 1987, section 2.D.
+    """
+    weight = (1 / sd**2)[:, None]
+    rotation, shift = fitted_pose(adjusted, ct, weight[:, 0])
+    fitted = adjusted @ rotation.T + shift
+    arm = ct - np.sum(weight * ct, axis=0) / weight.sum()
+    factor = float(np.sum(weight * arm * fitted) / np.sum(weight * arm * arm))
+    if _misfit(factor * ct, adjusted, sd) > 1:
+        return None
+    others = ~np.eye(len(ct), dtype=bool)
+    if any(_misfit(ct[row], adjusted[row], sd[row]) <= 1 for row in others):
+        return None
+    return factor
+
+
 def _exchanged(
     ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> tuple[int, int] | None:
-    """Return two markers that contradict CT, but agree with it when exchanged; or None."""
-    if _misfit(ct, adjusted, sd) <= 1:
-        return None
+    """Return two markers that agree with CT when exchanged, or None."""
     pairs = list(combinations(range(len(ct)), 2))
     misfits = []
     for first, second in pairs:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body, fitted_pose
 from fluoro_calib_ros.bodies.shapes import BodyPlaces, condition_number, estimate_shape
-from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
 
 SD_MM = np.array([0.03, 0.03, 0.06])
@@ -146,6 +146,10 @@ def in_cm(true, given):
     given /= 10
 
 
+def of_other_voxels(true, given):
+    given *= 1.03
+
+
 @pytest.mark.parametrize(
     ('change', 'kind', 'markers'),
     [
@@ -153,6 +157,7 @@ def in_cm(true, given):
         (exchanged, Kind.MARKERS_EXCHANGED, (1, 3)),
         (mirrored, Kind.BODY_MIRRORED, ()),
         (in_cm, Kind.WRONG_UNIT, ()),
+        (of_other_voxels, Kind.BODY_SCALED, ()),
     ],
 )
 def test_wrong_coordinates_of_ct_are_named(change, kind, markers):
@@ -163,7 +168,10 @@ def test_wrong_coordinates_of_ct_are_named(change, kind, markers):
     shape = estimate_shape(body, recording(rng, CORNERS))
     assert kinds(shape.findings) == [kind]
     assert shape.findings[0].place.target_id == markers
-    if markers:  # their CT coordinates do not contribute to the shape
+    if change is of_other_voxels:
+        assert shape.findings[0].severity == Severity.ERROR
+        assert shape.findings[0].numbers['factor'] == pytest.approx(1 / 1.03, abs=0.002)
+    if markers or change is of_other_voxels:  # wrong CT coordinates do not contribute to the shape
         assert np.abs(relative_errors(shape, CORNERS)).max() < 0.03
 
 

@@ -411,6 +411,13 @@ class Coverage:
         return tuple(int(i) for i in order if fractions[i] < SUFFICIENT_OF_AREA)
 
 
+def coverage_of(uv: ArrayLike, image_size: tuple[int, int]) -> Coverage:
+    """Return the coverage of an image by image points (n, 2) [px]."""
+    coverage = Coverage(image_size)
+    coverage.add(uv)
+    return coverage
+
+
 def _sums_of_areas(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the number of True cells (rows, columns) in each of the 3 x 3 areas."""
     thirds = np.linspace(0, CELLS, 4).astype(int)[:-1]

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..correction.fluoroscope_calibration import Calibrations
+from ..exposures.collector import AREAS, coverage_of
 from ..exposures.frame import Frames
 from ..exposures.names import Names
 from ..exposures.phantom import Phantom
@@ -29,10 +30,8 @@ from ..photogrammetry.rotations import matrix_from_quaternion
 from .figures import STYLE, Scale, common_scale, distortion_figure, svg_bytes
 from .report_figures import (
     bead_shifts,
-    covered_cells,
     distribution,
     exposure_bars,
-    missing_sides,
     residual_map,
 )
 from .residuals import Residuals, residuals_of
@@ -275,9 +274,8 @@ def _radiographs(
 def _fluoroscope(report: ReportInput, name: str, residuals: Residuals) -> dict[str, Any]:
     """Return the numbers of a fluoroscope in the report."""
     calibration = report.calibrations[name]
-    covered = covered_cells(residuals.uv, calibration.image_size)
+    coverage = coverage_of(residuals.uv, calibration.image_size)
     exposures = report.names.exposure_names()
-    missing = missing_sides(residuals.uv, calibration.image_size)
     sd = np.array([np.nan])
     if len(residuals.uv):
         sd = calibration.correction(residuals.uv, residuals.angle).sd
@@ -286,8 +284,8 @@ def _fluoroscope(report: ReportInput, name: str, residuals: Residuals) -> dict[s
         'entry': report.result['fluoroscopes'][name],
         'calibration': calibration,
         'model': model_text(calibration.model),
-        'covered': float(covered.mean()),
-        'missing': missing,
+        'covered': coverage.fraction,
+        'missing': [AREAS[area] for area in coverage.missing_areas],
         'correction_sd': float(np.median(sd)),
         'largest': _largest(residuals),
         'correlation': _correlation(calibration.interior_covariance),

@@ -18,7 +18,7 @@ from scipy.special import ndtri
 
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import SETTLED_PX, SelfCalibration
-from ..exposures.collector import CELLS, Coverage
+from ..exposures.collector import coverage_of
 from ..io.access import check_safe_name, make_folder, write_bytes
 from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.precision import geometric_redundancy
@@ -120,7 +120,7 @@ def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -
     width, height = image_size
     figure = new_figure(7.5, 7.5 * height / width + 0.6, f'{name}: residuals and coverage')
     axes = figure.subplots()
-    covered = covered_cells(residuals.uv, image_size)
+    covered = coverage_of(residuals.uv, image_size).covered
     axes.imshow(
         np.where(covered, np.nan, 1.0),
         extent=(-0.5, width - 0.5, height - 0.5, -0.5),
@@ -147,27 +147,6 @@ def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -
     if len(outlier_uv):
         axes.legend(loc='upper right')
     return figure
-
-
-def covered_cells(uv: NDArray[np.float64], image_size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return (CELLS, CELLS) whether a cell of the image is near an image point."""
-    coverage = Coverage(image_size)
-    coverage.add(uv)
-    return coverage.covered
-
-
-def missing_sides(uv: NDArray[np.float64], image_size: tuple[int, int]) -> list[str]:
-    """Return the names of the parts of the image of which less than half is covered."""
-    covered = covered_cells(uv, image_size)
-    third = CELLS // 3
-    rows = {'upper': slice(0, third), 'middle': slice(third, -third), 'lower': slice(-third, None)}
-    columns = {'left': rows['upper'], 'centre': rows['middle'], 'right': rows['lower']}
-    return [
-        f'{row} {column}'
-        for row, v in rows.items()
-        for column, u in columns.items()
-        if covered[v, u].mean() < 0.5
-    ]
 
 
 def exposure_bars(residuals: Residuals, name: str) -> Figure:

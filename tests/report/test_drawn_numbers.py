@@ -14,6 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from fluoro_calib_ros.correction.fluoroscope_calibration import NoiseProfile
+from fluoro_calib_ros.exposures.collector import coverage_of
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
 from fluoro_calib_ros.reconstruction.intersection import OK, REJECTED
@@ -31,10 +32,8 @@ from fluoro_calib_ros.report.figures import (
 from fluoro_calib_ros.report.motion import MAX_NAMED, _draw_gaps, points_figure
 from fluoro_calib_ros.report.report_figures import (
     bead_shifts,
-    covered_cells,
     distribution,
     exposure_bars,
-    missing_sides,
     residual_map,
 )
 from fluoro_calib_ros.report.residuals import (
@@ -211,7 +210,7 @@ def test_map_of_residuals_has_arrows_of_inliers_and_crosses():
     assert drawn.images[0].get_extent() == [-0.5, 319.5, 159.5, -0.5]
     grey = drawn.images[0].get_array()
     shown = np.ma.getmaskarray(grey) | np.isnan(np.ma.getdata(grey))
-    assert np.array_equal(shown, covered_cells(one.uv, SIZE)) and 0 < shown.mean() < 1
+    assert np.array_equal(shown, coverage_of(one.uv, SIZE).covered) and 0 < shown.mean() < 1
     arrows = drawn.collections[0]
     factor = arrows.U[0] / one.after[0, 0]
     assert factor > 1 and np.isclose(factor, float(f'{factor:.1g}'))
@@ -266,23 +265,6 @@ def test_noise_is_told_of_the_middle_and_of_the_border():
     profile = NoiseProfile(middle=0.9, rim=1.5, reach=1.0)
     assert _noise_text(Fake(image_sd=0.2, noise_profile=profile)) == '0.180; border 0.300'
     assert _noise_text(Fake(image_sd=0.2, noise_profile=None)) == '0.200'
-
-
-def test_parts_of_the_image_without_beads_are_named():
-    u, v = np.meshgrid(np.arange(0, 200, 4.0), np.arange(0, 160, 4.0))
-    uv = np.column_stack([u.ravel(), v.ravel()])
-    assert missing_sides(uv, SIZE) == ['upper right', 'middle right', 'lower right']
-    assert missing_sides(uv[uv[:, 1] > 60], SIZE)[:2] == ['upper left', 'upper centre']
-
-
-@pytest.mark.parametrize(('rows', 'missing'), [(3, 9), (4, 6)])
-def test_a_side_of_which_half_is_covered_is_not_missing(rows, missing):
-    """The upper third has ten rows of cells; a point also covers the row below it."""
-    width, height = np.array(SIZE) / 32
-    u, v = np.meshgrid((np.arange(32) + 0.5) * width, (np.arange(rows) + 0.5) * height)
-    uv = np.column_stack([u.ravel(), v.ravel()]) - 0.5
-    assert covered_cells(uv, SIZE).any(axis=1).sum() == rows + 1
-    assert len(missing_sides(uv, SIZE)) == missing
 
 
 def test_figure_of_a_distortion_keeps_the_shape_of_the_image():

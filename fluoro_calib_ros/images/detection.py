@@ -24,7 +24,16 @@ from scipy.spatial import cKDTree
 from ..errors import DataError
 from ..findings import Kind
 from .discs import set_apart
-from .light import COARSE_BLUR, Light, Noise, clipped_at, estimate_noise, vertex, wide_blur
+from .light import (
+    COARSE_BLUR,
+    Light,
+    Noise,
+    clipped_at,
+    estimate_noise,
+    vertex,
+    white_level,
+    wide_blur,
+)
 
 MIN_SIZE = 32  # smallest side of an image [px]
 SCALES = (1.1, 1.5, 2.1, 3.0, 4.2, 6.0, 8.5, 12.0, 17.0)  # standard deviations of the blur [px]
@@ -139,7 +148,7 @@ class _Sight:
     def of(cls, image: np.ndarray, beads: int, noise: Noise | None = None) -> _Sight:
         """Prepare the detection of so many beads in an image. Raises DataError."""
         _check(image)
-        grey = image.astype(np.float32)
+        grey = np.minimum(image, image.dtype.type(white_level(image))).astype(np.float32)
         if noise is None:
             noise = estimate_noise(grey, (image > image.min()) & (image < image.max()))
         typical = int(np.clip(SEEN_SHARE * beads, LEAST_TYPICAL, MOST_TYPICAL))
@@ -281,6 +290,8 @@ def _lit(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     contours = sorted(contours, key=cv2.contourArea, reverse=True)
+    if not contours:
+        return mask
     hull = cv2.convexHull(contours[0])
     field = cv2.drawContours(np.zeros_like(mask), [hull], -1, 1, -1)
     for contour in contours[1:MAX_PARTS]:

@@ -31,6 +31,8 @@ LAGS = 4  # largest lag at which noise is correlated [px]
 SECOND = np.array([1.0, -2.0, 1.0])  # kernel of second differences
 MIN_SEEN = 0.1  # least share of the variance in second differences: noise blurred by a pixel
 MIN_CLIPPED = 10  # largest number of outermost grey values that is no evidence of clipping
+WHITE_LEVELS = (255, 4095)  # largest grey values of 8 and 12 bits
+HOT_SHARE = 1e-5  # share of hot pixels: ten in an image of 1024 x 1024 px
 MIN_PIXELS = 1000  # pixels that estimates of noise and correlation need
 MAX_SLOW = 0.9  # largest share of slow changes; beyond it the noise is not visible
 
@@ -76,6 +78,19 @@ def wide_blur(grey: NDArray[np.float32], blur: float, coarsest: float) -> NDArra
     coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(coarse, (0, 0), blur / factor)
     return cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def white_level(image: np.ndarray) -> int:
+    """Return the largest grey value that an image of 8, 12 or 16 bit pixels may have.
+
+    Isolated pixels and a text of full scale do not count: 12 bit pixels are stored in 16 bits.
+    """
+    full = int(np.iinfo(image.dtype).max)
+    for white in WHITE_LEVELS:
+        above = np.count_nonzero(image > white)
+        if above <= HOT_SHARE * image.size or above == np.count_nonzero(image == full):
+            return min(white, full)
+    return full
 
 
 def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:

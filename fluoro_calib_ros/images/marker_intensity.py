@@ -30,7 +30,7 @@ from .detection import (
     responses,
 )
 from .imaging import estimate_profile
-from .light import Light, Noise, estimate_noise, vertex
+from .light import Light, Noise, estimate_noise, vertex, white_level
 from .marker_motion import GIVEN_GATE, GIVEN_SD_PX, MarkerStates, Motion, assign
 from .measurement import circles
 from .profile import Profile
@@ -75,7 +75,7 @@ class MarkerLook:
     """Appearance of markers in the images of a sequence."""
 
     scale: float  #: blur with the largest response [px]
-    inverted: bool  #: True if markers are bright in the image
+    white: float | None  #: grey value without light if markers are bright, None if they are dark
     field: NDArray[np.bool_]  #: (h, w), the field of view
     strength: float  #: response to a typical marker over the light around it
     floor: float  #: response below which noise is likely, at the usual light
@@ -92,7 +92,7 @@ class FilteredLight:
     """Light (h, w) of an image with dark markers, filtered for shadows of one size."""
 
     scale: float
-    inverted: bool  # True if markers are bright in the image
+    white: float | None  # as of MarkerLook
     light: NDArray[np.float32]
     response: NDArray[np.float32]
     around: NDArray[np.float32]  # mean of the surrounding light
@@ -149,8 +149,8 @@ class FilteredImage:
         self._by_scale: dict[float, tuple[FilteredLight, FilteredLight]] = {}
         grey = image.astype(np.float32)
         around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
-        top = float(np.iinfo(image.dtype).max)
-        self._lights = (grey, around), (top - grey, top - around)
+        self._white = white_level(image)
+        self._lights = (grey, around), (self._white - grey, self._white - around)
 
     def of_scale(self, scale: float) -> tuple[FilteredLight, FilteredLight]:
         """Return the image filtered for dark shadows and for bright shadows."""
@@ -158,8 +158,8 @@ class FilteredImage:
             dark, bright = self._lights
             filtered = responses(dark[0], scale)
             self._by_scale[scale] = (
-                FilteredLight(scale, False, dark[0], filtered[0], dark[1]),
-                FilteredLight(scale, True, bright[0], filtered[1], bright[1]),
+                FilteredLight(scale, None, dark[0], filtered[0], dark[1]),
+                FilteredLight(scale, self._white, bright[0], filtered[1], bright[1]),
             )
         return self._by_scale[scale]
 
@@ -172,7 +172,7 @@ class LightWindows:
         self._field = look.field.reshape(-1)
         self._all = bool(look.field.all())
         self.shape = image.shape
-        self._top = float(np.iinfo(image.dtype).max) if look.inverted else None
+        self._white = look.white
 
     def read(
         self, middle: NDArray[np.int64], offset: NDArray[np.int64]
@@ -195,7 +195,7 @@ class LightWindows:
             index = np.clip(row, 0, height - 1) * width + np.clip(column, 0, width - 1)
             valid &= self._field[index]
         grey = self._flat.take(index).astype(np.float32)
-        return (grey if self._top is None else self._top - grey), valid
+        return (grey if self._white is None else self._white - grey), valid
 
 
 def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
@@ -232,7 +232,7 @@ def _learn_look(
     for scale in MARKER_SCALES:
         lights: Sequence[FilteredLight] = image.of_scale(scale)
         if best is not None and best.clear:  # then the polarity is known
-            lights = lights[int(best.light.inverted) :][:1]
+            lights = lights[int(best.light.white is not None) :][:1]
         candidate = max(
             (_Typical.near(light, near) for light in lights), key=lambda typical: typical.snr
         )
@@ -260,14 +260,14 @@ def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
 def search_image(image: np.ndarray, look: MarkerLook) -> Shadows:
     """Find shadows in a whole image that may be markers."""
     grey = image.astype(np.float32)
-    light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
+    light = grey if look.white is None else look.white - grey
     return _find_shadows(look, _filtered(light, (2 * BACKGROUND_PX + 1,) * 2, look))
 
 
 def _filtered(light: NDArray[np.float32], box: tuple[int, int], look: MarkerLook) -> FilteredLight:
     """Filter light for shadows of a look; the surrounding light is the mean of a box."""
     (response,) = responses(light, look.scale, (False,))
-    return FilteredLight(look.scale, look.inverted, light, response, cv2.blur(light, box))
+    return FilteredLight(look.scale, look.white, light, response, cv2.blur(light, box))
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ class _Typical:
             raise DataError(cause, kind=Kind.NO_MARKERS)
         return MarkerLook(
             light.scale,
-            light.inverted,
+            light.white,
             field=light.field,
             strength=self.strength,
             floor=self.floor,

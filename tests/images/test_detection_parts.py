@@ -26,6 +26,7 @@ from fluoro_calib_ros.images.detection import (
 )
 from fluoro_calib_ros.images.light import LAGS, Noise
 from fluoro_calib_ros.images.marker_intensity import check_image
+from fluoro_calib_ros.images.markers import FirstMarkers, MarkerTracker
 
 RNG = np.random.default_rng(51)
 WHITE = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
@@ -260,3 +261,48 @@ def test_an_image_has_32_pixels_at_least(size, is_refused):
             detection._check(wrong)
     with pytest.raises(DataError, match='every pixel has the grey value 7'):
         detection._check(np.full((40, 40), 7, np.uint8))
+
+
+def discs(rng, light, contrast, size=512):
+    """Image of twelve by twelve discs with a radius of 5 px; their contrast is grey values."""
+    uv = np.stack(np.meshgrid(*[np.linspace(40, size - 40, 12)] * 2), -1).reshape(-1, 2)
+    uv = uv + rng.uniform(-4, 4, uv.shape)
+    v, u = np.mgrid[:size, :size]
+    grey = np.zeros((size, size))
+    for x, y in uv:
+        grey = np.maximum(grey, np.hypot(u - x, v - y) < 5)
+    grey = light + contrast * cv2.GaussianBlur(grey, (0, 0), 1.2)
+    return np.clip(grey + rng.normal(0, 15, grey.shape), 0, 4095).astype(np.uint16), uv
+
+
+@pytest.mark.parametrize('text', [np.s_[100:101, 5:6], np.s_[3:15, 5:60]])
+@pytest.mark.parametrize(('light', 'contrast'), [(1000, 1500), (2500, -1500)])
+def test_a_hot_pixel_or_a_text_of_full_scale_hides_no_bead(light, contrast, text):
+    image, uv = discs(np.random.default_rng(3), light, contrast)
+    image[text] = 65535
+    found = next(detection.likely_detections(image, len(uv)))
+    assert found.inverted == (contrast > 0)
+    away = np.linalg.norm(found.uv[:, None] - uv, axis=2).min(axis=0)
+    assert (away < 1).all() and len(found.uv) <= len(uv) + 3
+
+
+@pytest.mark.parametrize('bits', [8, 12])
+def test_bright_markers_are_measured_in_images_of_any_bit_depth(bits):
+    image, uv = discs(np.random.default_rng(4), 1000, 1500)
+    if bits == 8:
+        image = (image // 16).astype(np.uint8)
+    ids = np.arange(len(uv))
+    frame = MarkerTracker(first=FirstMarkers(ids, uv)).update(image, 1)
+    assert len(frame.target_id) == len(uv)
+    assert np.abs(frame.uv - uv[frame.target_id]).max() < 0.4  # discs have whole pixels
+
+
+@pytest.mark.parametrize('beads', [130, 500])
+def test_an_image_without_light_in_its_middle_is_refused_or_has_no_beads(beads):
+    shut = np.zeros((512, 512), np.uint8)
+    shut[20:30, 20:100] = 200  # a text on a closed collimator
+    assert len(next(detection.likely_detections(shut, beads)).uv) < 10
+    overexposed = np.full((512, 512), 255, np.uint8)
+    overexposed[:100] = np.random.default_rng(5).normal(150, 3, (100, 512))
+    with pytest.raises(DataError, match='saturated'):
+        next(detection.likely_detections(overexposed, beads))

@@ -173,7 +173,12 @@ def look_of(image, inverted=False):
     light = FilteredImage(image).of_scale(3.0)[int(inverted)]
     strength = float(np.median(np.sort(light.relative[light.maxima])[-12:]))
     return MarkerLook(
-        3.0, inverted, np.ones(image.shape, bool), strength, floor=0.1 * strength, light=15000.0
+        3.0,
+        65535 if inverted else None,
+        np.ones(image.shape, bool),
+        strength,
+        floor=0.1 * strength,
+        light=15000.0,
     )
 
 
@@ -204,7 +209,7 @@ def test_an_image_says_itself_whether_its_markers_are_bright():
     np.testing.assert_allclose(in_order(bright.uv), in_order(dark.uv), atol=0.02)
     sides = FilteredImage(image).of_scale(3.0)
     turned = FilteredImage(negative(image)).of_scale(3.0)
-    assert [one.inverted for one in (*sides, *turned)] == [False, True, False, True]
+    assert [one.white for one in (*sides, *turned)] == [None, 65535, None, 65535]
     np.testing.assert_allclose(sides[0].light, turned[1].light, atol=0.1)
     np.testing.assert_allclose(sides[0].around, turned[1].around, rtol=1e-4)
     np.testing.assert_allclose(sides[0].response, turned[1].response, atol=2.0)
@@ -229,7 +234,7 @@ def test_windows_are_read_as_the_image_is_beyond_its_edges_too():
     field[60:70, 80:95] = False
     offset = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-4, 5)), axis=-1).reshape(-1, 2)
     for inverted in (False, True):
-        windows = LightWindows(image, Fake(field=field, inverted=inverted))
+        windows = LightWindows(image, Fake(field=field, white=65535 if inverted else None))
         expected = np.pad(65535 - image if inverted else image, 9, mode='edge')
         inside = np.pad(field, 9)
         for middle in ([50, 30], [4, 4], [3, 70], [70, 3], [225, 145], [226, 80], [100, 146],
@@ -273,7 +278,8 @@ def guess_of(uv, motion=(0.0, 0.0)):
 
 
 def fitted(image, uv, motion=(0.0, 0.0), inverted=False, unit=1.0):
-    windows = LightWindows(image, Fake(field=np.ones(image.shape, bool), inverted=inverted))
+    white = 65535 if inverted else None
+    windows = LightWindows(image, Fake(field=np.ones(image.shape, bool), white=white))
     return fit_markers(windows, guess_of(uv, motion), PROFILE, Noise(0.0, 0.2 * unit, WHITE), {})
 
 
@@ -313,7 +319,7 @@ def test_a_first_image_says_which_markers_are_there():
     assert (start.states.motion.uv[12] == -2e4).all()
     assert start.size == (230, 150) and start.density == 2e-6
     assert start.profile.radius_px == pytest.approx(RADIUS_PX, rel=0.2)
-    assert not start.look.inverted
+    assert start.look.white is None
     few = learn_start(FilteredImage(image), ids[:6], uv[:6])
     free = 6 / start.look.field.sum()
     assert few.density == pytest.approx(free, rel=0.01)

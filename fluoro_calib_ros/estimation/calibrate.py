@@ -249,7 +249,7 @@ def _calibrated_group(
 ) -> SelfCalibration:
     """Calibrate fluoroscopes in one adjustment, and exclude exposures that do not fit."""
     excluded: tuple[Finding, ...] = ()
-    for _ in range(MAX_REPEATS):
+    for repeat in range(MAX_REPEATS):
         measured = measured_network(
             frames,
             request.phantom,
@@ -264,7 +264,8 @@ def _calibrated_group(
             name: [f for f in exposures if (name, f.number) not in misfits]
             for name, exposures in frames.items()
         }
-        if not misfits or any(len(exposures) < MIN_EXPOSURES for exposures in fitting.values()):
+        too_few = any(len(exposures) < MIN_EXPOSURES for exposures in fitting.values())
+        if not misfits or too_few or repeat == MAX_REPEATS - 1:
             break
         excluded += tuple(misfits.values())
         frames = fitting

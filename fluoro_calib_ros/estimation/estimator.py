@@ -65,7 +65,8 @@ class GaugeKind(Enum):
     NONE = 'none'
 
 
-UNIT_PX = 512.0  # unit of the image coordinates in the basis; any fixed length would do
+# Unit of the image coordinates in the basis: with half a usual image, the basis is about one.
+UNIT_PX = 512.0
 
 
 def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:

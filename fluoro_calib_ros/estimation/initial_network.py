@@ -124,7 +124,7 @@ UNTILTED_RAD = np.deg2rad(5.0)
 TILTED_RAD = np.deg2rad(20.0)  # least tilt of flat targets that is advised
 # Two exposures show the same pose of the phantom if their rotation and distance differ by less.
 MIN_POSE_RAD = np.deg2rad(2.0)
-MIN_POSE_MM = 20.0
+MIN_POSE_SHIFT = 0.02  # of the distance from the source; 20 mm in a usual rig
 AXIAL_FACTOR = 10.0  # uncertainty of a distance along the optical axis, relative to one across it
 MAX_MISFIT = 8.0  # limit of the residuals of a resection, relative to the median of the exposures
 
@@ -567,7 +567,7 @@ def _require_different_poses(name: str, resections: Sequence[Resection | None]) 
     )
     places = np.array([-resection.rotation @ resection.position_mm for resection in oriented])
     shift = np.max(np.abs(places - places[0]) / (1, 1, AXIAL_FACTOR))
-    if turn < MIN_POSE_RAD and shift < MIN_POSE_MM:
+    if turn < MIN_POSE_RAD and shift < MIN_POSE_SHIFT * np.median(np.abs(places[:, 2])):
         raise DataError(
             f'all {len(oriented)} exposures show the phantom in one pose (turned by at most '
             f'{np.rad2deg(turn):.1f} degrees); turn and move it between the exposures',

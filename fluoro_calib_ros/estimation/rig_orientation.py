@@ -389,6 +389,13 @@ def _require_still(frames: Sequence[Frame], still_px: float) -> None:
             )
 
 
+def _spread(numbers: set[int], count: int) -> set[int]:
+    """Return at most `count` of the numbers, evenly spread."""
+    ordered = sorted(numbers)
+    count = min(count, len(ordered))
+    return {ordered[i] for i in np.linspace(0, len(ordered) - 1, count).astype(int)}
+
+
 def _paired(frames: Frames) -> dict[str, list[Frame]]:
     """Return frames that the first fluoroscope shares with another, at most MAX_PAIRS each.
 
@@ -399,14 +406,15 @@ def _paired(frames: Frames) -> dict[str, list[Frame]]:
     for b, name in enumerate(others, 1):
         if not numbers[name] & numbers[first]:
             raise DataError(_unpaired(tuple(frames), b))
-    # Exposures of all fluoroscopes are preferred; they are spread evenly over the numbers.
-    common = sorted(numbers[first].intersection(n for name in others for n in numbers[name]))
-    complete = [n for n in common if all(n in numbers[name] for name in others)]
-    usable = complete if len(complete) >= MAX_PAIRS else common
-    selected = np.unique(np.linspace(0, len(usable) - 1, MAX_PAIRS).astype(int))
-    selected_numbers = {usable[i] for i in selected}
+    # Exposures of all fluoroscopes are preferred; others are spread evenly over each pair.
+    shared = {name: numbers[name] & numbers[first] for name in others}
+    complete = set.intersection(*shared.values())
+    selected = _spread(complete, MAX_PAIRS)
+    missing = MAX_PAIRS - len(selected)
+    for both in shared.values():
+        selected |= _spread(both - complete, missing)
     return {
-        name: [frame for frame in exposures if frame.number in selected_numbers]
+        name: [frame for frame in exposures if frame.number in selected]
         for name, exposures in frames.items()
     }
 

@@ -150,7 +150,8 @@ def target_statistics(
         )
     rays = _rays_of(network, adjustment, precision)
     offset, covariance, square = _intersect(network, rays, adjustment.noise)
-    covariance = covariance + (network.survey_sd_mm**2)[:, None, None] * np.eye(3)
+    covariance /= adjustment.noise.information_factor(adjustment.q)
+    covariance += (network.survey_sd_mm**2)[:, None, None] * np.eye(3)
     testable = np.isfinite(offset).all(axis=1)
     tested_offset = offset[testable]
     standardised = np.linalg.solve(covariance[testable], tested_offset[..., None])[..., 0]

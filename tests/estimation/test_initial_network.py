@@ -258,24 +258,26 @@ def test_exposures_whose_residuals_are_many_times_the_median_do_not_fit(factor, 
     [
         (1.9, (0, 0, 0), True),
         (2.1, (0, 0, 0), False),
-        (0, (19.0, 0, 0), True),
-        (0, (-21.0, 0, 0), False),
-        (0, (0, 21.0, 0), False),
-        (0, (0, 0, 190.0), True),
-        (0, (0, 0, -210.0), False),
+        (0, (29.0, 0, 0), True),
+        (0, (-31.0, 0, 0), False),
+        (0, (0, 31.0, 0), False),
+        (0, (0, 0, 290.0), True),
+        (0, (0, 0, -310.0), False),
     ],
 )
-def test_poses_differ_by_a_turn_or_a_shift(degrees, shift_mm, same):
+@pytest.mark.parametrize('size', [1.0, 0.1])
+def test_poses_differ_by_a_turn_or_a_shift(degrees, shift_mm, same, size):
     """A shift along the optical axis counts a tenth; a turn about the phantom is no shift."""
     first = matrix_from_vector(np.array([0.3, -0.2, 0.5]))
-    place = np.array([10.0, 20.0, 1500.0])
+    place = size * np.array([10.0, 20.0, 1500.0])
+    shift_mm = size * np.array(shift_mm)
 
     def resection(turn, shift):
         rotation = turn @ first
         return Resection(rotation, -rotation.T @ (place + shift), 1.0, np.ones(1, bool))
 
     turn = matrix_from_vector(np.deg2rad(degrees) * np.array([0.0, 0.6, 0.8]))
-    found = [resection(np.eye(3), 0), None, resection(turn, np.array(shift_mm))]
+    found = [resection(np.eye(3), 0), None, resection(turn, shift_mm)]
     if same:
         with rigs.refused(Kind.ONE_POSE, exposures=2) as error:
             _require_different_poses('a', found)

@@ -356,6 +356,9 @@ def test_many_exposures_are_thinned_evenly():
     frames['b'] = frames['b'][:3]
     numbers = {name: [f.number for f in of_one] for name, of_one in _paired(frames).items()}
     assert len(numbers['a']) == MAX_PAIRS and numbers['a'] == numbers['c']
+    frames['b'], frames['c'] = frames['c'], frames['b'][1:] + frames['a'][7:10]
+    numbers = {name: {f.number for f in of_one} for name, of_one in _paired(frames).items()}
+    assert numbers['c'] == {f.number for f in frames['c']}  # none of the few is left out
 
 
 @pytest.mark.parametrize('turning', [(), ('a',), ('b',)])

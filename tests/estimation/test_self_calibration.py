@@ -466,8 +466,9 @@ def test_so_many_exposures_remain_that_a_calibration_is_possible(monkeypatch):
 
 
 def test_a_calibration_is_repeated_at_most_twice(monkeypatch):
-    made, _ = grouped(monkeypatch, [{('a', n): n} for n in range(9)], exposures=12)
+    made, excluded = grouped(monkeypatch, [{('a', n): n} for n in range(9)], exposures=12)
     assert len(made) == 3
+    assert excluded == (0, 1, 'few')  # those that the last calibration does not use
 
 
 def noise_of(loss, nu, between=None):

@@ -215,6 +215,24 @@ def fixed_corrections(
     return correction, replace(network, sigma=sigma)
 
 
+# Standard deviation of image points over sigma0 if their sigma was 1: inliers of a Student's t with
+# at least 3 degrees of freedom scatter by 1 to 1.4 times its scale.
+UNIT_SIGMA = (0.9, 1.6)
+
+
+def with_comparable_sigma(frames: Frames, calibrations: Calibrations) -> Frames:
+    """Return frames without sigma where the points of their calibration had none.
+
+    Its sigma0 is then the noise of image points [px], and not a factor of their sigma [px].
+    """
+    return {
+        name: [replace(frame, sigma=None) for frame in exposures]
+        if UNIT_SIGMA[0] < calibrations[name].image_sd / calibrations[name].sigma0 < UNIT_SIGMA[1]
+        else exposures
+        for name, exposures in frames.items()
+    }
+
+
 def noise_of_calibrations(loss: str, calibrations: Iterable[FluoroscopeCalibration]) -> Noise:
     """Return the noise model of calibrations: medians of their scales and degrees of freedom."""
     known = list(calibrations)

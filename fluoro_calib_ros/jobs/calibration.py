@@ -38,6 +38,7 @@ from ..checks.verdict import validate_or_report
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations, calibrate_request
+from ..estimation.fixed_calibration import with_comparable_sigma
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
@@ -88,6 +89,7 @@ def adjust(
     used = select_calibrations(calibrations, frames)
     cleaned, strays = frames_without_strays(frames, phantom)
     require_phantom(cleaned, phantom)
+    cleaned = with_comparable_sigma(cleaned, used)
     result = adjust_with_calibrations(cleaned, phantom, used, loss)
     if misfits(result, used, cleaned):
         uncorrected_result = adjust_with_calibrations(cleaned, phantom, uncorrected(used), loss)

@@ -623,6 +623,18 @@ def test_adjusted_exposures_that_contradict_the_calibrations_are_doubtful():
     assert doubts[0].numbers['ratio'] > 2 and doubts[0].severity is Severity.ERROR
 
 
+@pytest.mark.parametrize('sigma0, image_sd', [(0.25, 0.25), (1.0, 0.25)])
+def test_points_that_tell_their_sigma_fit_a_calibration_of_points_that_did_not(sigma0, image_sd):
+    held = {
+        name: replace(c, sigma0=sigma0, image_sd=image_sd) for name, c in calibrations().items()
+    }
+    with_sigma = {
+        name: [replace(f, sigma=np.full(len(f.target_id), 0.25)) for f in of_one]
+        for name, of_one in frames().items()
+    }
+    assert adjust(with_sigma, rig().phantom, held).findings == ()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ('change', 'sentence', 'verdict'),

@@ -215,8 +215,8 @@ def fixed_corrections(
     return correction, replace(network, sigma=sigma)
 
 
-# Standard deviation of image points over sigma0 if their sigma was 1: inliers of a Student's t with
-# at least 3 degrees of freedom scatter by 1 to 1.4 times its scale.
+# Standard deviation of image points over sigma0 if their sigma was 1: inliers of a Student's t
+# with at least 3 degrees of freedom scatter by 1 to 1.4 times its scale.
 UNIT_SIGMA = (0.9, 1.6)
 
 

@@ -145,6 +145,7 @@ class Kind(str, Enum):
     BODY_ON_A_LINE = 'body_on_a_line'
     BODY_SCALED = 'body_scaled'
     BODY_UNSEEN = 'body_unseen'
+    JOINT_APART = 'joint_apart'
     MARKER_LOOSE = 'marker_loose'
     MARKER_MIGRATED = 'marker_migrated'
     MARKERS_EXCHANGED = 'markers_exchanged'

@@ -62,6 +62,7 @@ from fluoro_calib_ros.jobs import healing, result_folder
 from fluoro_calib_ros.jobs import orientation as orienting
 from fluoro_calib_ros.jobs import reconstruction as reconstructing
 from fluoro_calib_ros.jobs import report as comparing
+from fluoro_calib_ros.jobs.bodies import _apart
 from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
 from fluoro_calib_ros.jobs.extraction import ImageResult, bent_shadows
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
@@ -525,6 +526,12 @@ MAKERS = {
     Kind.BODY_ON_A_LINE: lambda: _stability(_body('femur'), 150.0, 0.1)[0],
     Kind.BODY_SCALED: lambda: shape(lambda given: 1.03 * given),
     Kind.BODY_UNSEEN: lambda: _unseen(_body('femur')),
+    Kind.JOINT_APART: lambda: _apart(
+        Fake(
+            joint=Fake(name='k', proximal='a', distal='b', convention='grood_suntay_knee'),
+            translations=np.array([[0.0, 120.0, 160.0], [np.nan] * 3]),
+        )
+    ),
     Kind.MARKER_LOOSE: lambda: shape(moves=0.5),
     Kind.MARKER_MIGRATED: lambda: shape(lambda given: given + np.eye(5, 3)),
     Kind.MARKERS_EXCHANGED: lambda: shape(lambda given: given[[1, 0, 2, 3, 4]]),
@@ -870,6 +877,10 @@ SENTENCES = {
     Kind.BODY_SCALED: (
         'body femur: distances between its markers in space are # times those of its '
         'coordinates: check the voxel size of the CT, and the scale of the phantom'
+    ),
+    Kind.JOINT_APART: (
+        'joint k: the origins of a and b are # mm apart: check which body is proximal, and the '
+        'landmarks and their unit'
     ),
     Kind.BODY_UNSEEN: (
         'body femur: no exposure has three of its markers in space: its shape is not estimated'

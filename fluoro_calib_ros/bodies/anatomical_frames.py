@@ -277,6 +277,7 @@ class Convention:
     #: kinds of landmark frames; empty if there are none
     proximal_landmarks: str = ''
     distal_landmarks: str = ''
+    origins_meet: bool = False  #: whether both origins are at the joint
 
     @property
     def is_euler(self) -> bool:
@@ -323,6 +324,7 @@ def _isb(name: str, angles: str, translations: str, proximal: str, distal: str) 
         lateral=2,
         proximal_landmarks=proximal,
         distal_landmarks=distal,
+        origins_meet=name in ('isb_hip', 'isb_ankle'),
     )
 
 
@@ -338,6 +340,7 @@ _SHOULDER = Convention(
     branch=-1,
     proximal_landmarks='scapula_isb',
     distal_landmarks='humerus_isb',
+    origins_meet=True,
 )
 _SHIFTS = 'lateral_shift anterior_shift proximal_shift'
 _CLINICAL = (
@@ -352,6 +355,7 @@ _CLINICAL = (
         lateral=0,
         proximal_landmarks='femur_grood_suntay',
         distal_landmarks='tibia_grood_suntay',
+        origins_meet=True,
     ),
     _isb('isb_hip', 'flexion adduction internal_rotation', _SHIFTS, 'pelvis_isb', 'femur_isb'),
     # The frame of the calcaneus is that of the tibia in neutral position.
@@ -371,7 +375,12 @@ _CLINICAL = (
         'metacarpal_isb',
     ),
     _SHOULDER,
-    replace(_SHOULDER, name='isb_thoracohumeral', proximal_landmarks='thorax_isb'),
+    replace(
+        _SHOULDER,
+        name='isb_thoracohumeral',
+        proximal_landmarks='thorax_isb',
+        origins_meet=False,
+    ),
 )
 
 CONVENTIONS = {one.name: one for one in (*_sequences(), *_CLINICAL)}

@@ -181,15 +181,20 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
 
 
 def _with_true_ct(body: Body, findings: Sequence[Finding]) -> Body:
-    """Return a body at the scale of space, without CT coordinates that belong to other places."""
-    factor = 1.0
+    """Return a body at the scale of space, with each CT coordinate at its marker or omitted."""
+    xyz = body.xyz_mm
     sd = body.sd_mm
     for finding in findings:
+        rows = np.flatnonzero(np.isin(body.target_id, finding.place.target_id))
         if finding.kind == Kind.BODY_SCALED:
-            factor = finding.numbers['factor']
-        elif finding.kind in _WRONG_BY_CT:
+            xyz = finding.numbers['factor'] * xyz
+        elif finding.kind == Kind.MARKERS_EXCHANGED:
+            order = np.arange(len(xyz))
+            order[rows] = rows[::-1]
+            xyz, sd = xyz[order], sd[order]
+        elif finding.kind == Kind.MARKER_MIGRATED:
             sd = np.where(np.isin(body.target_id, finding.place.target_id), np.inf, sd)
-    return replace(body, xyz_mm=factor * body.xyz_mm, sd_mm=sd)
+    return replace(body, xyz_mm=xyz, sd_mm=sd)
 
 
 def learned_shape(

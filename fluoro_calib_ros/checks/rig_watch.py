@@ -266,6 +266,29 @@ class DriftVerdict:
         return self.finding.sentence
 
 
+@dataclass(frozen=True, kw_only=True)
+class RigEvidence:
+    """What the rays of a recording say about its rig.
+
+    Attributes
+    ----------
+    drift : DriftVerdict or None
+        None if the drift watch is switched off.
+    disagreement : str
+        Set if frames that were paired by number are far apart in time.
+    widening : float
+        Factor of the limit of false matches at the end; above 1 if the rays miss each other by
+        more than their standard deviations allow.
+    noise : Finding or None
+        Set if image points have no sigma and their rays show more noise than the calibration.
+    """
+
+    drift: DriftVerdict | None = None
+    disagreement: str = ''
+    widening: float = 1.0
+    noise: Finding | None = None
+
+
 class RecordingDriftWatch(RigDriftWatch):
     """RigDriftWatch that stores its alarms, as one in the middle of a recording may end.
 

@@ -21,7 +21,14 @@ from .arguments import (
     options_of,
     read_oriented_source,
 )
-from .output import ProgressBar, print_findings, print_notes, print_result, print_unpaired
+from .output import (
+    ProgressBar,
+    print_findings,
+    print_notes,
+    print_result,
+    print_rig_evidence,
+    print_unpaired,
+)
 
 if TYPE_CHECKING:
     from ..jobs.bodies import BodiesOutcome
@@ -100,7 +107,14 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..io.calibration import orientation_path
     from ..io.folder import check_output_folder
     from ..io.versions import write_learned_shapes
-    from ..jobs.bodies import BODIES_FOLDER, BodiesOptions, Film, save_bodies, track_bodies
+    from ..jobs.bodies import (
+        BODIES_FOLDER,
+        BodiesOptions,
+        Film,
+        has_times,
+        save_bodies,
+        track_bodies,
+    )
     from ..jobs.learning import learn_shapes
 
     path = arguments.orientation or orientation_path(arguments.calibration)
@@ -114,6 +128,11 @@ def run(arguments: argparse.Namespace) -> bool:
         raise DataError(
             f'{arguments.source}: the file does not contain the times of its exposures; give '
             'their rate, --rate HZ'
+        )
+    if arguments.rate is not None and has_times(recording.frames):
+        raise DataError(
+            f'{arguments.source}: the recording has the times of its exposures; --rate is for '
+            'files without them'
         )
     neutral = None
     if arguments.neutral is not None:
@@ -158,8 +177,7 @@ def run(arguments: argparse.Namespace) -> bool:
             film = Film(arguments.film, calibrations, views, bar)
         save_bodies(arguments.out, outcome, arguments.report, film)
     print_unpaired(arguments.source, outcome.unpaired)
-    if outcome.noise is not None:
-        print_notes([f'{arguments.source}: {outcome.noise.sentence}'])
+    print_rig_evidence(arguments.source, outcome, arguments.reject)
     print_findings(outcome.findings, 'doubtful: ')
     _print(arguments, outcome)
     return all(finding.severity is not Severity.ERROR for finding in outcome.findings)
@@ -167,16 +185,19 @@ def run(arguments: argparse.Namespace) -> bool:
 
 def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:
     """Print a summary of the accuracy of poses and joints."""
-    from ..io.result_document import finding_document
+    from ..io.result_document import finding_document, rig_document
 
     summary = outcome.summary()
     lines = [f'{len(outcome.exposures)} exposures, written to {arguments.out}']
     lines += [_body_line(name, figures) for name, figures in summary['bodies'].items()]
     for joint, angles in summary['joints'].items():
         lines += _joint_lines(joint, angles)
+    if outcome.drift:
+        lines.append(f'drift watch: {outcome.drift.message}')
     document = {
         'out': str(arguments.out),
         **summary,
+        **rig_document(outcome, outcome.exposures[0].stamp_ns),
         'findings': [finding_document(finding) for finding in outcome.findings],
     }
     print_result(arguments, document, '\n'.join(lines))
@@ -203,7 +224,7 @@ def _joint_lines(joint: str, angles: Mapping[str, Mapping[str, float]]) -> list[
     if all(math.isnan(figures['range_deg']) for figures in angles.values()):
         return [f'{joint}: no angles: no exposure has poses of both bodies']
     return [
-        f'{joint}: {name} over {figures["range_deg"]:.1f} degrees, sd {figures["sd_deg"]:.3f} '
-        '(median)'
+        f'{joint}: {name} {figures["least_deg"]:.1f} to {figures["most_deg"]:.1f} degrees, sd '
+        f'{figures["sd_deg"]:.3f} (median)'
         for name, figures in angles.items()
     ]

@@ -21,6 +21,7 @@ from ..findings import Finding, Severity, summed_up
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ..checks.rig_watch import RigEvidence
     from ..estimation.rounds import Round
 
 # Escape sequences (ECMA-48, select graphic rendition).
@@ -97,6 +98,27 @@ def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:
         counts = ', '.join(f'{name} {count}' for name, count in lost.items())
         print_note(
             f'{source}: frames without partner of the other fluoroscopes, not used: {counts}'
+        )
+
+
+def print_rig_evidence(source: Path, evidence: RigEvidence, reject: float) -> None:
+    """Print what the rays of a recording say about its rig.
+
+    reject: limit of false matches [standard deviations].
+    """
+    if evidence.disagreement:
+        print_note(f'{source}: {evidence.disagreement}')
+    if evidence.drift is not None and evidence.drift.widening is not None:
+        print_note(f'{source}: {evidence.drift.widening.sentence}')
+    if evidence.noise is not None:
+        print_note(f'{source}: {evidence.noise.sentence}')
+    if evidence.widening > 1:
+        print_note(
+            f'{source}: the rays miss each other by more than their standard deviations allow; '
+            f'the limit of false matches was widened {evidence.widening:.1f} times, to '
+            f'{reject * evidence.widening:.1f} standard deviations; check the sigma of the image '
+            'points, whether they count from 1, how many are outside the calibrated area, and '
+            'whether a fluoroscope has moved since its calibration'
         )
 
 

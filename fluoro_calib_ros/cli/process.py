@@ -420,22 +420,28 @@ def trial_row(
 
 def _reconstruction_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
     """Return the cells that a reconstruction adds to the row of a trial."""
-    drift = document.get('drift') or {}
     cells = {
         'frames': document['frames'],
         'points': document['points'],
         'points_ok': document['status']['OK'],
-        'widening': document['widening'],
-        'drift': drift.get('kind', ''),
     }
+    cells |= _rig_cells(document)
+    return cells | _doubts({**row, **cells}, document['lost_targets'])
+
+
+def _rig_cells(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the cells on what the rays of a trial say about its rig."""
+    drift = document.get('drift') or {}
+    widening = document.get('widening', 1.0)
+    cells = {'widening': widening, 'drift': drift.get('kind', '')}
     if drift.get('level') in WRONG_DRIFT:
         return cells | {'verdict': 'fail', 'cause': drift['message']}
-    if document['widening'] > 1:
+    if widening > 1:
         return cells | {
             'verdict': 'fail',
             'cause': 'the rays miss each other by more than their standard deviations allow',
         }
-    return cells | _doubts(row, document['lost_targets'])
+    return cells
 
 
 def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
@@ -446,7 +452,8 @@ def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[s
     for joint, angles in document['joints'].items():
         for name, angle in angles.items():
             cells |= {f'{joint}_{name}_{key}': angle[key] for key in ('range_deg', 'sd_deg')}
-    return cells | _doubts(row, document['findings'])
+    cells |= _rig_cells(document)
+    return cells | _doubts({**row, **cells}, document['findings'])
 
 
 def _doubts(row: Mapping[str, Any], findings: Iterable[Mapping[str, Any]]) -> dict[str, Any]:

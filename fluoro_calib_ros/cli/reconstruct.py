@@ -19,7 +19,14 @@ from .arguments import (
     read_oriented_source,
     rigid_clusters,
 )
-from .output import ProgressBar, print_note, print_notes, print_result, print_unpaired
+from .output import (
+    ProgressBar,
+    print_note,
+    print_notes,
+    print_result,
+    print_rig_evidence,
+    print_unpaired,
+)
 
 if TYPE_CHECKING:
     from ..jobs.reconstruction import ReconstructionOutcome
@@ -98,20 +105,7 @@ def run(arguments: argparse.Namespace) -> None:
 
         write_bytes(arguments.figure, png_bytes(outcome.plot(recording.names)))
     print_unpaired(arguments.source, outcome.unpaired)
-    if outcome.disagreement:
-        print_note(f'{arguments.source}: {outcome.disagreement}')
-    if outcome.drift is not None and outcome.drift.widening is not None:
-        print_note(f'{arguments.source}: {outcome.drift.widening.sentence}')
-    if outcome.noise is not None:
-        print_note(f'{arguments.source}: {outcome.noise.sentence}')
-    if outcome.widening > 1:
-        print_note(
-            f'{arguments.source}: the rays miss each other by more than their standard deviations '
-            f'allow; the limit of false matches was widened {outcome.widening:.1f} times, to '
-            f'{arguments.reject * outcome.widening:.1f} standard deviations; check the sigma of '
-            'the image points, whether they count from 1, how many are outside the calibrated '
-            'area, and whether a fluoroscope has moved since its calibration'
-        )
+    print_rig_evidence(arguments.source, outcome, arguments.reject)
     for finding in outcome.lost_targets:
         print_note(f'{arguments.source}: {finding}')
     _print(arguments, outcome)
@@ -119,7 +113,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> None:
     """Print the summary of a reconstruction."""
-    from ..io.result_document import drift_document, finding_document, orientation_document
+    from ..io.result_document import finding_document, orientation_document, rig_document
 
     counts = outcome.status_counts
     total = sum(counts.values())
@@ -131,10 +125,8 @@ def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> Non
         'points': total,
         'status': counts,
         'unpaired': outcome.unpaired,
-        'noise': None if outcome.noise is None else finding_document(outcome.noise),
-        'widening': outcome.widening,
+        **rig_document(outcome, outcome.frames[0].stamp_ns),
         'lost_targets': [finding_document(finding) for finding in outcome.lost_targets],
-        'drift': drift_document(outcome.drift, outcome.frames[0].stamp_ns),
         'orientation': orientation_document(outcome.orientation),
     }
     by_status = ', '.join(f'{count} {name}' for name, count in counts.items() if count)

@@ -220,7 +220,7 @@ def fixed_corrections(
 UNIT_SIGMA = (0.9, 1.6)
 
 
-def with_comparable_sigma(frames: Frames, calibrations: Calibrations) -> Frames:
+def with_comparable_sigma(frames: Frames, calibrations: Calibrations) -> dict[str, list[Frame]]:
     """Return frames without sigma where the points of their calibration had none.
 
     Its sigma0 is then the noise of image points [px], and not a factor of their sigma [px].
@@ -228,7 +228,7 @@ def with_comparable_sigma(frames: Frames, calibrations: Calibrations) -> Frames:
     return {
         name: [replace(frame, sigma=None) for frame in exposures]
         if UNIT_SIGMA[0] < calibrations[name].image_sd / calibrations[name].sigma0 < UNIT_SIGMA[1]
-        else exposures
+        else list(exposures)
         for name, exposures in frames.items()
     }
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..checks.check import Check, Validation
-from ..checks.rig_watch import DriftVerdict
+from ..checks.rig_watch import DriftVerdict, RigEvidence
 from ..correction.calibration_record import Field
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.constraints import RelativeOrientation
@@ -221,6 +221,15 @@ def orientation_document(orientation: RigOrientation) -> dict[str, Any]:
                 orientation.sd_rad,
             )
         },
+    }
+
+
+def rig_document(evidence: RigEvidence, begin_ns: int) -> dict[str, Any]:
+    """Return what rays say about a rig as a dict; begin_ns: stamp of the first exposure."""
+    return {
+        'noise': None if evidence.noise is None else finding_document(evidence.noise),
+        'widening': evidence.widening,
+        'drift': drift_document(evidence.drift, begin_ns),
     }
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,17 +16,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bodies.anatomical_frames import convention
 from ..bodies.body import AXIS_MM, STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
 from ..brief import brief_repr
-from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
+from ..checks.rig_watch import RecordingDriftWatch, RigEvidence
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.frame import Frames
-from ..exposures.pairing import RecordedPairing
+from ..exposures.frame import Frame, Frames
+from ..exposures.pairing import RecordedPairing, disagreement_of_recording
 from ..exposures.stamps import NS_PER_S
 from ..findings import Finding, Kind, Place, Severity, sentences
 from ..images.corrector import iterated
@@ -42,7 +43,8 @@ from ..options import option
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.intersection import OK, OUTSIDE, Intersector
+from ..reconstruction.epipolar import why_rays_miss
+from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import (
     IntersectedViews,
@@ -174,8 +176,8 @@ class BodiesOptions(RecordedPairing):
 
 
 @dataclass(frozen=True)
-class BodiesOutcome:
-    """Bodies of a recording.
+class BodiesOutcome(RigEvidence):
+    """Bodies of a recording, and what its rays say about the rig.
 
     Attributes
     ----------
@@ -188,8 +190,6 @@ class BodiesOutcome:
     unpaired : mapping of str to int
         Number of frames without partner, by fluoroscope.
     findings : tuple of Finding
-    noise : Finding or None
-        Set if image points have no sigma and their rays show more noise than the calibration.
     """
 
     __repr__ = brief_repr
@@ -200,7 +200,6 @@ class BodiesOutcome:
     joints: list[JointMotion]
     unpaired: Mapping[str, int]
     findings: tuple[Finding, ...]
-    noise: Finding | None = None
 
     @property
     def bodies(self) -> tuple[Body, ...]:
@@ -262,13 +261,19 @@ class BodiesOutcome:
         joints = {}
         for motion in self.joints:
             is_known = np.isfinite(motion.angles).all(axis=1)
-            span = sd = np.full(3, np.nan)
+            least = most = sd = np.full(3, np.nan)
             if is_known.any():
-                span = np.degrees(np.ptp(motion.angles[is_known], axis=0))
+                least = np.degrees(motion.angles[is_known].min(axis=0))
+                most = np.degrees(motion.angles[is_known].max(axis=0))
                 sd = np.degrees(np.nanmedian(motion.sd[is_known, :3], axis=0))
             joints[motion.joint.name] = {
-                name: {'range_deg': float(a), 'sd_deg': float(s)}
-                for name, a, s in zip(motion.angle_names, span, sd)
+                name: {
+                    'range_deg': float(most[k] - least[k]),
+                    'sd_deg': float(sd[k]),
+                    'least_deg': float(least[k]),
+                    'most_deg': float(most[k]),
+                }
+                for k, name in enumerate(motion.angle_names)
             }
         return {'bodies': bodies, 'joints': joints}
 
@@ -334,14 +339,16 @@ def track_bodies(
     unseen_places = {finding.place for finding in findings if finding.kind is Kind.BODY_UNSEEN}
     unseen = [_unseen(body_poses) for body_poses in poses if not body_poses.known.any()]
     findings += [finding for finding in unseen if finding.place not in unseen_places]
+    motions = _joints(joints, poses, rest_poses or poses)
+    findings += filter(None, map(_apart, motions))
     return BodiesOutcome(
         tuple(shapes),
         tracked,
         poses=poses,
-        joints=_joints(joints, poses, rest_poses or poses),
+        joints=motions,
         unpaired=recording.unpaired,
         findings=tuple(findings),
-        noise=recording.noise,
+        **{field.name: getattr(recording, field.name) for field in fields(RigEvidence)},
     )
 
 
@@ -354,16 +361,24 @@ class IntersectedExposure:
     views: IntersectedViews
     orientation: RigOrientation  #: with the covariance widened after a drift alarm
 
+    @property
+    def target_id(self) -> NDArray[np.int64]:
+        """Target ids (n,) of the points."""
+        return self.views.target_id
+
+    @property
+    def points(self) -> IntersectedPoints:
+        """The points in space."""
+        return self.views.points
+
 
 @dataclass(frozen=True)
-class IntersectedRecording:
-    """Intersected exposures of a recording, and related results."""
+class IntersectedRecording(RigEvidence):
+    """Intersected exposures of a recording, and what its rays say about the rig."""
 
     exposures: list[IntersectedExposure]
     sides: NDArray[np.float64]  #: (F,) longer sides of the images [px]
     unpaired: Mapping[str, int]  #: number of frames without partner, by fluoroscope
-    drift: DriftVerdict  #: verdict of the drift watch
-    noise: Finding | None  #: set if image points without sigma are less precise than beads
 
 
 def intersected(
@@ -373,7 +388,7 @@ def intersected(
     options: BodiesOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> IntersectedRecording:
-    """Pair and intersect the frames of a recording. Raises DataError."""
+    """Pair and intersect the frames of a recording. Raises DataError, as `reconstruct` does."""
     names = orientation.fluoroscopes
     frames, noise = with_observed_noise(frames, calibrations, orientation, options)
     paired, unpaired = pair_recording(frames, names, options)
@@ -381,20 +396,19 @@ def intersected(
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
     intersector = Intersector(orientation, options.reject)
     scatter = ObservedScatter()
+    timed = has_times(frames)
     sizes = {name: calibrations[name].image_size for name in names}
     watch = RecordingDriftWatch(orientation, sizes)
     out = []
     for count, exposure in enumerate(paired, 1):
+        if options.rate is not None and not timed:
+            exposure = _stamped(exposure, options.rate)
         widened, _ = watch.widened(intersector)
         views, present_frames = intersect_frames(
             exposure, calibrations, intersector, scatter, watch
         )
-        stamp = present_frames[0].stamp_ns
-        if options.rate is not None:
-            stamp = 1 + round(present_frames[0].number * NS_PER_S / options.rate)
-        out.append(
-            IntersectedExposure(present_frames[0].number, stamp, views, widened.orientation)
-        )
+        first = present_frames[0]
+        out.append(IntersectedExposure(first.number, first.stamp_ns, views, widened.orientation))
         if progress is not None:
             progress(count, len(paired))
     stamps = np.array([entry.stamp_ns for entry in out])
@@ -402,8 +416,36 @@ def intersected(
         raise DataError(
             'the exposures have no times, or times out of order; give the rate of the recording'
         )
-    sides = np.array([float(max(sizes[name])) for name in names])
-    return IntersectedRecording(out, sides, unpaired=unpaired, drift=watch.verdict(), noise=noise)
+    finding = why_rays_miss(
+        out, frames, calibrations, intersector, pairing=options, widening=scatter.factor
+    )
+    if finding is not None:
+        raise DataError(finding)
+    disagreement = ''
+    if timed and options.pair_by == 'frame_number':
+        disagreement = disagreement_of_recording({name: frames[name] for name in names})
+    return IntersectedRecording(
+        out,
+        sides=np.array([float(max(sizes[name])) for name in names]),
+        unpaired=unpaired,
+        drift=watch.verdict(),
+        disagreement=disagreement,
+        widening=scatter.factor,
+        noise=noise,
+    )
+
+
+def has_times(frames: Frames) -> bool:
+    """Return whether frames have stamps."""
+    return any(frame.stamp_ns for exposures in frames.values() for frame in exposures)
+
+
+def _stamped(exposure: Mapping[str, Frame], rate: float) -> dict[str, Frame]:
+    """Return the frames of an exposure with the time of their number at a rate [Hz]."""
+    return {
+        name: replace(frame, stamp_ns=1 + round(frame.number * NS_PER_S / rate))
+        for name, frame in exposure.items()
+    }
 
 
 def estimated_shapes(
@@ -495,6 +537,30 @@ def _unseen(poses: BodyPoses) -> Finding:
         place=Place(name=f'body {poses.body}'),
         severity=Severity.WARNING,
         numbers={'exposures': float(len(poses.number))},
+    )
+
+
+# Largest distance of two origins at one joint [mm]: twice that in the knee, or from the acromial
+# angle to the head of the humerus, of adults (30 to 50 mm).
+MAX_ORIGINS_MM = 100.0
+
+
+def _apart(motion: JointMotion) -> Finding | None:
+    """Return a finding if the bones of a joint do not meet, or None."""
+    distance = np.linalg.norm(motion.translations, axis=1)
+    if not convention(motion.joint.convention).origins_meet or not np.isfinite(distance).any():
+        return None
+    median = float(np.nanmedian(distance))
+    if median <= MAX_ORIGINS_MM:
+        return None
+    joint = motion.joint
+    return Finding(
+        Kind.JOINT_APART,
+        f'the origins of {joint.proximal} and {joint.distal} are {median:.0f} mm apart',
+        place=Place(name=f'joint {joint.name}'),
+        advice='check which body is proximal, and the landmarks and their unit',
+        severity=Severity.WARNING,
+        numbers={'distance_mm': median},
     )
 
 

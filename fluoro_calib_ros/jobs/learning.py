@@ -81,7 +81,7 @@ def learn_shapes(
     recording = intersected(seen, calibrations, recorded, options, progress)
     exposures = recording.exposures
     drift = recording.drift
-    if drift.state is not None:
+    if drift is not None and drift.state is not None:
         raise DataError(replace(drift.finding, advice='no shapes are learned during a drift'))
     shapes = estimated_shapes(bodies, recording)
     learned = [_known(shape.body) for shape in shapes if _is_good(shape)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..bodies.body import Body
 from ..brief import brief_repr
-from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
+from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch, RigEvidence
 from ..correction.fluoroscope_calibration import Calibrations, ids_of
 from ..errors import DataError
 from ..exposures.frame import Frames
@@ -22,9 +22,9 @@ from ..exposures.pairing import RecordedPairing, disagreement_of_recording
 from ..findings import Finding, Kind, Severity
 from ..io.bodies import point_table
 from ..options import option
-from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
+from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.epipolar import cause_of_misses, mismatch
+from ..reconstruction.epipolar import why_rays_miss
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.lost_targets import lost_targets
 from ..reconstruction.observed_noise import with_observed_noise
@@ -61,8 +61,8 @@ class ReconstructionOptions(RecordedPairing):
 
 
 @dataclass(frozen=True)
-class ReconstructionOutcome:
-    """Points of a recording.
+class ReconstructionOutcome(RigEvidence):
+    """Points of a recording, and what its rays say about the rig.
 
     Attributes
     ----------
@@ -72,17 +72,8 @@ class ReconstructionOutcome:
         Number of frames without partner, by fluoroscope.
     orientation : RigOrientation
         Of the fluoroscopes that were used.
-    drift : DriftVerdict or None
-        None if the drift watch is switched off.
-    disagreement : str
-        Set if frames that were paired by number are far apart in time.
-    widening : float
-        Factor of the limit of false matches at the end; above 1 if the rays miss each other by
-        more than their standard deviations allow.
     lost_targets : tuple of Finding
         On targets that are rejected in most of their exposures.
-    noise : Finding or None
-        Set if image points have no sigma and their rays show more noise than the calibration.
     """
 
     __repr__ = brief_repr
@@ -90,11 +81,7 @@ class ReconstructionOutcome:
     frames: list[ReconstructedFrame]
     unpaired: Mapping[str, int]
     orientation: RigOrientation
-    drift: DriftVerdict | None
-    disagreement: str = ''
-    widening: float = 1.0
     lost_targets: tuple[Finding, ...] = ()
-    noise: Finding | None = None
 
     def to_dataframe(self, names: Names | None = None) -> pandas.DataFrame:
         """Return the points as a pandas DataFrame, with a column name if targets have names.
@@ -170,9 +157,9 @@ def reconstruct(
     )
     if not reconstructed:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
-    finding = mismatch(reconstructed, frames, calibrations, intersector, options)
-    if finding is None and scatter.factor >= MAX_WIDENING:
-        finding = cause_of_misses(reconstructed, frames, calibrations, intersector, options)
+    finding = why_rays_miss(
+        reconstructed, frames, calibrations, intersector, pairing=options, widening=scatter.factor
+    )
     if finding is not None:
         raise DataError(finding)
     lost = lost_targets(reconstructed, frames, calibrations, intersector, options)

@@ -21,6 +21,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +32,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame, Frames
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind
+from ..photogrammetry.noise import MAX_WIDENING
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix
 from .intersection import (
@@ -43,7 +45,7 @@ from .intersection import (
     IntersectedPoints,
     Intersector,
 )
-from .reconstruct import ReconstructedFrame, reconstruct_recording
+from .reconstruct import reconstruct_recording
 
 MIN_BASE = 1e-6  # minimum distance of the sources over their distance from the origin of the rig
 
@@ -204,6 +206,23 @@ RECENT = 100  # number of recent exposures of a stream
 BETTER = 0.3
 CLOSER = 0.6
 
+
+class ExposurePoints(Protocol):
+    """Points of an exposure, such as a ReconstructedFrame."""
+
+    @property
+    def number(self) -> int:
+        """Number of the exposure."""
+
+    @property
+    def target_id(self) -> NDArray[np.int64]:
+        """Target ids (n,)."""
+
+    @property
+    def points(self) -> IntersectedPoints:
+        """Points of the targets."""
+
+
 Trial = tuple[Finding, dict[str, list[Frame]]]
 
 
@@ -235,7 +254,7 @@ def missing_rays(share: float, reason: Finding) -> Finding:
     return replace(reason, cause=cause, numbers={**reason.numbers, 'share': share})
 
 
-def share_rejected(reconstructed: Sequence[ReconstructedFrame]) -> tuple[float, int]:
+def share_rejected(reconstructed: Sequence[ExposurePoints]) -> tuple[float, int]:
     """Return the share of rejected points, and the number of points in two views."""
     status = np.concatenate([frame.points.status for frame in reconstructed] or [np.empty(0, int)])
     rejected, total, _ = _counts(status)
@@ -249,14 +268,33 @@ def _counts(status: NDArray[np.integer]) -> tuple[int, int, int]:
     return rejected, rejected + int(counts[OK] + counts[OUTSIDE]), int(counts[SINGLE_VIEW])
 
 
+def why_rays_miss(
+    reconstruction: Sequence[ExposurePoints],
+    frames: Frames,
+    calibrations: Calibrations,
+    intersector: Intersector,
+    pairing: RecordedPairing,
+    widening: float,
+) -> Finding | None:
+    """Return why a reconstruction is implausible, or None if nothing is wrong with it.
+
+    widening: factor by which the rays miss each other by more than expected. If they miss by a
+    little, a reason is returned only if a trial identifies it.
+    """
+    finding = mismatch(reconstruction, frames, calibrations, intersector, pairing)
+    if finding is None and widening >= MAX_WIDENING:
+        finding = cause_of_misses(reconstruction, frames, calibrations, intersector, pairing)
+    return finding
+
+
 def mismatch(
-    reconstruction: Sequence[ReconstructedFrame],
+    reconstruction: Sequence[ExposurePoints],
     frames: Frames,
     calibrations: Calibrations,
     intersector: Intersector,
     pairing: RecordedPairing,
 ) -> Finding | None:
-    """Return why a reconstruction is implausible, or None if nothing is wrong with it."""
+    """Return why most rays miss each other, or None if most meet."""
     share, total = share_rejected(reconstruction)
     seen = sum(len(frame.target_id) for frame in reconstruction)
     if not total and seen >= MIN_POINTS:
@@ -273,7 +311,7 @@ def mismatch(
 
 
 def cause_of_misses(
-    reconstruction: Sequence[ReconstructedFrame],
+    reconstruction: Sequence[ExposurePoints],
     frames: Frames,
     calibrations: Calibrations,
     intersector: Intersector,
@@ -305,13 +343,13 @@ def cause_of_misses(
     return replace(found, cause=text)
 
 
-def _largest(reconstructed: Sequence[ReconstructedFrame]) -> set[int]:
+def _largest(reconstructed: Sequence[ExposurePoints]) -> set[int]:
     """Return the numbers of the frames with the most targets, for trials of causes."""
     largest = sorted(reconstructed, key=lambda frame: -len(frame.target_id))[:MAX_TRIED]
     return {frame.number for frame in largest}
 
 
-def _miss(reconstructed: Sequence[ReconstructedFrame]) -> float:
+def _miss(reconstructed: Sequence[ExposurePoints]) -> float:
     """Return the median miss of the rays over its standard deviation; infinite for few rays."""
     points = [frame.points for frame in reconstructed]
     size = np.concatenate([p.standardised[p.status != SINGLE_VIEW] for p in points] or [[]])

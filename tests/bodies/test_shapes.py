@@ -171,6 +171,9 @@ def test_wrong_coordinates_of_ct_are_named(change, kind, markers):
     if change is of_other_voxels:
         assert shape.findings[0].severity == Severity.ERROR
         assert shape.findings[0].numbers['factor'] == pytest.approx(1 / 1.03, abs=0.002)
+    if change in (exchanged, of_other_voxels):  # the frame is that of CT
+        assert np.abs(shape.body.xyz_mm - CORNERS).max() < 4 * CT_SD_MM
+        assert np.sqrt(np.diagonal(shape.body.frame_covariance)[:3]).max() < CT_SD_MM
     if markers or change is of_other_voxels:  # wrong CT coordinates do not contribute to the shape
         assert np.abs(relative_errors(shape, CORNERS)).max() < 0.03
 

@@ -299,6 +299,31 @@ def test_a_table_without_times_asks_for_the_rate(knee, tmp_path, capsys):
     assert run(*arguments, '--rate', '120') == 0
     poses = rows(tmp_path / 'motion' / 'poses.csv')
     assert float(poses[12]['time_s']) == pytest.approx(0.1, abs=1e-6)
+    in_bag = ('bodies', knee / 'walking', *arguments[2:], '--rate', '60')
+    assert run(*in_bag) == 1  # the times of a bag are not replaced
+    assert 'has the times of its exposures' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('late', 'swap', 'cause'), [(1, False, 'frame numbers'), (0, True, 'interchanged')]
+)
+def test_rays_that_do_not_meet_give_no_joint_angles(knee, tmp_path, capsys, late, swap, cause):
+    table = tmp_path / 'w.csv'
+    assert run('convert', knee / 'walking', '--to', 'observations', '--out', table) == 0
+    seen = rows(table)
+    for row in seen:
+        if row['fluoroscope'] == 'b':
+            row['exposure'] = int(row['exposure']) + late
+        if swap:
+            row['fluoroscope'] = {'a': 'b', 'b': 'a'}[row['fluoroscope']]
+    lines = [','.join(str(value) for value in row.values()) for row in seen]
+    table.write_text('\n'.join([','.join(seen[0]), *lines]) + '\n')
+    code = run(
+        *('bodies', table, '--bodies', knee / 'bodies.csv', '--rate', '120'),
+        *('--calibration', knee / 'result', '--out', tmp_path / 'motion'),
+    )
+    assert code == 1 and cause in capsys.readouterr().err
+    assert not (tmp_path / 'motion').exists()
 
 
 def test_poses_are_converted_for_other_programs(knee, tmp_path):

@@ -277,9 +277,13 @@ def correct(
 
     uv (n, 2) are observed pixels, sigma (n,) their standard deviations [px], by default that of
     the calibration. angle: of the C-arm [rad], a number or (n,), if the correction depends on it.
+    Raises DataError for arrays of another shape.
     """
-    return calibration.correct(
-        np.asarray(uv, dtype=float),
-        None if sigma is None else np.asarray(sigma, dtype=float),
-        angle=angle,
-    )
+    uv = np.asarray(uv, dtype=float)
+    if uv.ndim != 2 or uv.shape[1] != 2:
+        raise DataError(f'uv has the shape {uv.shape}, expected (n, 2)')
+    if sigma is not None:
+        sigma = np.asarray(sigma, dtype=float)
+        if sigma.shape != (len(uv),):
+            raise DataError(f'sigma has the shape {sigma.shape}, expected ({len(uv)},)')
+    return calibration.correct(uv, sigma, angle=angle)

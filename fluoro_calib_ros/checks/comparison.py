@@ -201,7 +201,7 @@ def compare_calibrations(
     compared = _difference(uv, (first.interior, second.interior), parts)
     covariance = first.interior_covariance + second.interior_covariance
     difference = second.interior - first.interior
-    if first.interior_estimated and second.interior_estimated:
+    if first.interior_estimated or second.interior_estimated:
         difference = _interior_difference(uv, (first, second), parts)
     test, limit = _test(difference, covariance)
     return Comparison(

@@ -31,7 +31,7 @@ from ..estimation.start_orientation import FEW_TARGETS
 from ..exposures.collector import MIN_COMMON_TARGETS
 from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import MISTAKEN_UNITS, Phantom
-from ..findings import Finding, Kind, Place, first_few
+from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.diagnosis import MAX_RELATIVE_SD
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
@@ -47,6 +47,7 @@ MAX_EXTENT = 6.0  # maximum distance of a target from the middle, over that exte
 SD_MM = (1e-6, 1e3)  # plausible range for surveyed coordinates
 SIGMA_PX = (1e-4, 1e3)  # plausible range for image points
 MIN_REACH = 0.6  # minimum extent of the image points over the image size, to the right and down
+MARGIN = 0.03  # share of an image without image points that says nothing about its size
 MIN_SHARE = 0.5  # minimum share of the ids that exist on the phantom
 # Median residual over the longer side of the image above which a known orientation is wrong.
 WRONG_ORIENTATION = 0.1
@@ -266,7 +267,9 @@ def find_wrong_input(frames: Frames, phantom: Phantom) -> list[Finding]:
     """
     out = []
     for name, exposures in frames.items():
-        finding = wrong_image_size(exposures) or _wrong_exposures(exposures, phantom)
+        finding = wrong_image_size(exposures)
+        if finding is None or finding.severity is Severity.WARNING:
+            finding = _wrong_exposures(exposures, phantom)
         if finding is not None:
             out.append(replace(finding, place=Place((name,))))
     return out
@@ -371,20 +374,43 @@ def _wrong_exposures(exposures: Sequence[Frame], phantom: Phantom) -> Finding | 
 
 
 def wrong_image_size(exposures: Sequence[Frame]) -> Finding | None:
-    """Return a finding if the image points fill only the upper left part of the image."""
+    """Return a finding if the image points fill only the upper left part of the image, or None.
+
+    It is a warning if they begin at the left and upper border and end equally far from the right
+    and the lower one, as those of an image that is said to be larger than it is.
+    """
     if not exposures:
         return None
+    size = np.array(exposures[0].image_size)
+    low = np.min([np.min(frame.uv, axis=0) for frame in exposures], axis=0)
     reach = np.max([np.max(frame.uv, axis=0) for frame in exposures], axis=0)
-    width, height = exposures[0].image_size
-    if not (reach < MIN_REACH * np.array([width, height])).all():
+    margin = 1 - reach / size
+    is_wrong = bool((reach < MIN_REACH * size).all())
+    is_doubtful = (
+        abs(margin[0] - margin[1]) < MARGIN
+        and margin.min() > 3 * MARGIN
+        and (low / size).max() < MARGIN
+    )
+    if not is_wrong and not is_doubtful:
         return None
     return Finding(
         Kind.WRONG_IMAGE_SIZE,
         f'the image points reach only to u = {reach[0]:.0f}, v = {reach[1]:.0f} of an image of '
-        f'{width} x {height} px',
+        f'{size[0]} x {size[1]} px',
         advice='the image size is wrong, or the phantom covers one corner only',
+        severity=Severity.ERROR if is_wrong else Severity.WARNING,
         numbers={'largest_u': float(reach[0]), 'largest_v': float(reach[1])},
     )
+
+
+def doubtful_image_sizes(frames: Frames) -> list[Finding]:
+    """Return warnings on the image sizes of exposures by fluoroscope."""
+    found = {name: wrong_image_size(exposures) for name, exposures in frames.items()}
+    return [
+        replace(finding, place=Place((name,)))
+        for name, finding in found.items()
+        if finding is not None and finding.severity is Severity.WARNING
+    ]
 
 
 def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:

@@ -150,7 +150,7 @@ def _process(
     trials: Mapping[str, Sequence[Step]],
 ) -> bool:
     """Run all steps in the working directory, write the table and print it. Raises DataError."""
-    from ..io.calibration import stored_verdict
+    from ..io.calibration import rig_verdict
     from ..processes import Programs
 
     with Programs() as programs:
@@ -161,7 +161,7 @@ def _process(
             raise DataError(
                 f'no calibration: {failed[0].message} ({study.folder / study.out / LOG})'
             )
-        verdict = stored_verdict(study.calibration).verdict or 'cannot tell'
+        verdict = rig_verdict(study.calibration)
         if verdict == 'fail':
             raise DataError(
                 'the verdict of the calibration is fail, the trials are not processed: '

@@ -389,6 +389,15 @@ def stored_verdict(directory: PathLike) -> Verdict:
     return Verdict(str(document.get('verdict', 'cannot tell')), reasons, calibration_ids)
 
 
+def rig_verdict(directory: PathLike) -> str:
+    """Return the verdict on all calibrations of a folder, 'cannot tell' if it leaves one out."""
+    stored = stored_verdict(directory)
+    names = {path.name.removesuffix(SUFFIX) for path in Path(directory).glob(f'*{SUFFIX}')}
+    if stored.verdict == 'pass' and not names <= set(stored.calibration_id):
+        return 'cannot tell'
+    return stored.verdict or 'cannot tell'
+
+
 def _digest_of_file(path: Path) -> str:
     """Return SHA-256 (hex) of a file, or of the values of a JSON document; '' without a file."""
     if not path.exists():

@@ -21,6 +21,7 @@ from ..checks.check import Validation
 from ..checks.held_out import corrected_already, misfits, poor_fits, uncorrected
 from ..checks.inputs import (
     copied_exposures,
+    doubtful_image_sizes,
     exclusion_reason,
     find_wrong_input,
     find_wrong_orientation,
@@ -231,6 +232,8 @@ def run_calibration(
         raise DataError(*faults)
     result = _calibrated(request, progress)
     excluded += _with_causes(request, result)
+    if not request.known_orientations:
+        excluded += doubtful_image_sizes(valid_frames(request.frames))
     faults += [*implausible(request, result), *_interchanged(result)]
     if faults and not force:
         raise DataError(*faults)

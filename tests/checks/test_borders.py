@@ -355,9 +355,8 @@ def test_a_place_is_told_in_words_and_numbers():
     assert told == 'the middle right of the image (about u 900, v 100)'
 
 
-@pytest.mark.parametrize('which', [(), ('first',), ('second',)])
-def test_an_interior_that_was_fixed_is_compared_as_it_is(which):
-    """A common gauge is used only if both are estimated."""
+@pytest.mark.parametrize('which', [(), ('first',), ('second',), ('first', 'second')])
+def test_interiors_are_compared_in_one_gauge_unless_both_were_fixed(which):
     one = rigs.pincushion('a', (400, 300))
     made = {
         name: replace(
@@ -369,12 +368,12 @@ def test_an_interior_that_was_fixed_is_compared_as_it_is(which):
         for name, shift in (('first', np.zeros(3)), ('second', np.array([3.0, -2, 20])))
     }
     found = compare_calibrations(made['first'], made['second'])
-    if which:
+    np.testing.assert_allclose(
+        found.interior_sd, np.sqrt((2 - len(which)) * np.array([4, 4, 100]))
+    )
+    if len(which) == 2:
         np.testing.assert_allclose(found.interior, [3, -2, 20])
-        np.testing.assert_allclose(found.interior_sd, [2, 2, 10])
-        assert found.interior_test == pytest.approx(9 / 4 + 4 / 4 + 400 / 100)
     else:
-        np.testing.assert_allclose(found.interior_sd, np.sqrt([8, 8, 200]))
         assert found.interior == pytest.approx([3, -2, 20], abs=3)
         np.testing.assert_allclose(found.interior[:2], [3, -2], atol=0.2)
 

@@ -41,6 +41,7 @@ from fluoro_calib_ros.checks.held_out import _white, exposure_limits, misfits
 from fluoro_calib_ros.checks.inputs import (
     _are_copied,
     copied_exposures,
+    doubtful_image_sizes,
     find_wrong_phantom,
     implausible,
     shared_exposures,
@@ -129,7 +130,7 @@ def test_shared_exposures_are_of_both_fluoroscopes():
 
 @pytest.mark.parametrize(
     ('reach', 'is_wrong'),
-    [((0.59, 0.59), True), ((0.61, 0.59), False), ((0.59, 0.61), False)],
+    [((0.59, 0.59), True), ((0.7, 0.59), False), ((0.59, 0.7), False)],
 )
 def test_image_size_is_wrong_where_points_reach_neither_side(reach, is_wrong):
     corner = np.array(reach) * SIZE
@@ -138,7 +139,26 @@ def test_image_size_is_wrong_where_points_reach_neither_side(reach, is_wrong):
     assert (found is not None) is is_wrong
     if found:
         assert found.numbers == {'largest_u': corner[0], 'largest_v': corner[1]}
+        assert found.severity is Severity.ERROR
     assert wrong_image_size([]) is None
+
+
+@pytest.mark.parametrize(
+    ('low', 'reach', 'is_doubtful'),
+    [
+        ((0.01, 0.02), (0.75, 0.76), True),  # the image is said to be a third too large
+        ((0.01, 0.02), (0.95, 0.95), False),
+        ((0.01, 0.02), (0.75, 0.95), False),  # a wide image
+        ((0.1, 0.12), (0.75, 0.76), False),  # a round field
+    ],
+)
+def test_image_size_is_doubtful_where_points_end_equally_far_from_two_borders(
+    low, reach, is_doubtful
+):
+    exposures = {'a': [frame(uv=np.array([low, reach]) * SIZE)]}
+    found = doubtful_image_sizes(exposures)
+    assert len(found) == is_doubtful
+    assert all(finding.severity is Severity.WARNING for finding in found)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from rigs import run
 from fluoro_calib_ros import processes
 from fluoro_calib_ros.cli.process import STATE, Done, _Work, trial_row
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.calibration import load_calibration, with_digests
+from fluoro_calib_ros.io.calibration import load_calibration, rig_verdict, with_digests
 from fluoro_calib_ros.io.csv_table import write_table
 from fluoro_calib_ros.io.rig_file import read_study
 
@@ -143,6 +143,11 @@ def test_trials_are_processed_once_and_again_where_something_changed(study, fork
     (study / 'result' / 'validation.json').write_text(json.dumps(document))
     assert changed_by(study) == ({'trials/run/points.csv'}, 0)
     assert [row['verdict'] for row in rows_of(study).values()] == ['pass']
+    assert rig_verdict(study / 'result') == 'pass'
+    only_a = {**document, 'calibration_id': {'a': given['a']}}
+    only_a = with_digests(study / 'result', only_a, 'a')
+    (study / 'result' / 'validation.json').write_text(json.dumps(only_a))
+    assert rig_verdict(study / 'result') == 'cannot tell'  # nothing is known about b
 
 
 def test_a_trial_that_fails_does_not_stop_the_others(study, capsys, forked):

@@ -10,6 +10,7 @@ import pytest
 from rigs import pincushion, turning
 from scipy.spatial import cKDTree
 
+from fluoro_calib_ros.api import DataError, correct
 from fluoro_calib_ros.correction.fluoroscope_calibration import (
     packed_profile,
     unpacked_profile,
@@ -255,3 +256,12 @@ def test_nearest_training_points_of_a_block_are_among_its_candidates(most):
             inside = np.flatnonzero(np.linalg.norm(points - uv[row], axis=1) < distance[row])
             assert set(inside) <= set(near)
     assert sorted(rows) == list(range(400)) and given > 0
+
+
+def test_points_of_another_shape_are_not_corrected():
+    calibration = pincushion('a', (400, 300))
+    with pytest.raises(DataError, match=r'uv has the shape \(2, 5\), expected \(n, 2\)'):
+        correct(calibration, np.zeros((2, 5)))
+    with pytest.raises(DataError, match=r'sigma has the shape \(2,\), expected \(3,\)'):
+        correct(calibration, np.full((3, 2), 150.0), sigma=[1, 2])
+    assert len(correct(calibration, [[100, 150.0]], sigma=[0.2]).uv) == 1

@@ -6,11 +6,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from ..correction.base import CorrectionModel
 from ..correction.neighbours import KnnModel, LocalLinearModel, NeighbourModel, NeighbourTable
@@ -25,11 +25,10 @@ from .estimator import (
     GaugeKind,
     exposure_folds,
     gauge_basis,
-    gauge_rows,
 )
 from .neighbour_regression import CrossValidation
 from .parametric import StepwiseTerms
-from .priors import GAUGE_SD_PX, prior_precision, trend_columns
+from .priors import prior_precision
 from .rounds import SelfCalibration
 
 # Errors of models that cannot follow a distortion, from their difference to a model that can.
@@ -154,7 +153,7 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
         AdjustmentProblem(terms.network, run.measured.image_size, run.before, terms.gauge_kinds)
     )
     scores = dict.fromkeys((START_MODEL, *ALTERNATIVES), 0.0)
-    for f in range(len(run.measured.fluoroscopes)):
+    for f, part in enumerate(terms.parts):
         rows = network.rows(f)
         rows = rows[inside[rows]]
         if len(rows) > MAX_IMAGE_POINTS:
@@ -174,10 +173,9 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
                 model_type, uv, fold=fold, candidates=candidates, near=neighbours, tested=tested
             )
             scores[model_type.kind] += float(np.min(validation.scores(values, information)))
+        prior = prior_precision(part.functions, part.prior) + part.gauge
         held_out = {
-            START_MODEL: _held_out(
-                _prior_of(terms, f), terms.functions[f](uv), values, weight, fold
-            ),
+            START_MODEL: _held_out(prior, part.functions(uv), values, weight, fold),
             'parametric': _held_out_of_terms(
                 parametric.values[f][inside[network.rows(f)]], values, weight, fold
             ),
@@ -189,43 +187,16 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
     return best if scores[best] < MAX_RATIO * scores[START_MODEL] else None
 
 
-@dataclass(frozen=True)
-class _SeriesPrior:
-    """Prior precisions of the coefficients of a series, in parts."""
-
-    trend: NDArray[np.float64]  #: (2t, 2t) of the trend; u precedes v
-    signal: NDArray[np.float64]  #: (s, s) of the sines, the same for u and v
-    #: (2, g, t + s) factors of the coefficients of u and of v; the sums of the products have unit
-    #: precision
-    gauge: NDArray[np.float64]
-
-
-def _prior_of(terms: CollocationTerms, f: int) -> _SeriesPrior:
-    """Return the prior of the series of fluoroscope f."""
-    part = terms.parts[f]
-    functions = part.functions
-    m = len(functions)
-    t = functions.trend
-    precision = prior_precision(functions, part.prior)
-    trend = trend_columns(functions)
-    rows = gauge_rows(part.values, part.uv, part.interior, part.gauge_kind)
-    return _SeriesPrior(
-        precision[np.ix_(trend, trend)],
-        precision[t:m, t:m],
-        rows.reshape(-1, 2, m).transpose(1, 0, 2) / GAUGE_SD_PX,
-    )
-
-
 def _held_out(
-    prior: _SeriesPrior,
+    prior: NDArray[np.float64],
     functions: NDArray[np.float64],
     values: NDArray[np.float64],
     weight: NDArray[np.float64],
     fold: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Predict values (N, 2) by functions fitted without the fold of each value.
+    """Predict values (N, 2) by functions (N, m) fitted without the fold of each value.
 
-    functions: (N, m) trend, then sines. values: (N, 2). weight, fold: (N,). Returns (N, 2).
+    prior: (2m, 2m) precision of the coefficients, those of u first. weight, fold: (N,).
     """
     out = np.empty_like(values)
     root = np.sqrt(weight)[:, None]
@@ -237,48 +208,10 @@ def _held_out(
     gram = np.sum(grams, axis=0)
     right = np.sum(rights, axis=0)
     for rows, held_out_gram, held_out_right in zip(folds, grams, rights):
-        out[rows] = functions[rows] @ _solved(prior, gram - held_out_gram, right - held_out_right)
-    return out
-
-
-def _solved(
-    prior: _SeriesPrior, gram: NDArray[np.float64], right: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Solve normal equations (m, m) and (m, 2) for the coefficients (m, 2) of u and v.
-
-    The sines, which have the same matrix for u and v, are eliminated first. Trend and gauge
-    remain; the products of the gauge are unknowns of their own.
-    """
-    t = len(gram) - len(prior.signal)
-    g = prior.gauge.shape[1]
-    trend_part = gram[t:, :t]
-    gauge_part = prior.gauge[:, :, t:]
-    columns = np.column_stack([trend_part, *gauge_part.transpose(0, 2, 1), right[t:]])
-    factor = cho_factor(gram[t:, t:] + prior.signal, lower=True)
-    solved = cho_solve(factor, columns)
-    by_trend = solved[:, :t]
-    by_gauge = [solved[:, t : t + g], solved[:, t + g : t + 2 * g]]
-    by_right = solved[:, t + 2 * g :]
-    size = 2 * t + g
-    reduced = np.zeros((size, size))
-    reduced_right = np.zeros(size)
-    reduced[: 2 * t, : 2 * t] = prior.trend
-    reduced[2 * t :, 2 * t :] = -np.eye(g)
-    for axis in (0, 1):
-        block = slice(axis * t, (axis + 1) * t)
-        reduced[block, block] += gram[:t, :t] - trend_part.T @ by_trend
-        mixed = prior.gauge[axis, :, :t].T - trend_part.T @ by_gauge[axis]
-        reduced[block, 2 * t :] = mixed
-        reduced[2 * t :, block] = mixed.T
-        reduced[2 * t :, 2 * t :] -= gauge_part[axis] @ by_gauge[axis]
-        reduced_right[block] = right[:t, axis] - trend_part.T @ by_right[:, axis]
-        reduced_right[2 * t :] -= gauge_part[axis] @ by_right[:, axis]
-    solution = np.linalg.solve(reduced, reduced_right)
-    out = np.empty((len(gram), 2))
-    for axis in (0, 1):
-        out[:t, axis] = solution[axis * t : (axis + 1) * t]
-        eliminated = by_trend @ out[:t, axis] + by_gauge[axis] @ solution[2 * t :]
-        out[t:, axis] = by_right[:, axis] - eliminated
+        fitted = gram - held_out_gram
+        factor = cho_factor(prior + block_diag(fitted, fitted), lower=True, overwrite_a=True)
+        coefficients = cho_solve(factor, (right - held_out_right).T.ravel())
+        out[rows] = functions[rows] @ coefficients.reshape(2, -1).T
     return out
 
 

@@ -25,7 +25,6 @@ from fluoro_calib_ros.estimation.model_choice import (
     _held_out,
     _held_out_of_terms,
     _precision_by,
-    _prior_of,
     better_model,
     with_errors_by,
 )
@@ -76,9 +75,9 @@ def test_predictions_of_held_out_exposures_are_those_of_a_dense_solution(gauge):
     values = rng.normal(0, 2.0, network.uv.shape)
     weight = rng.uniform(1.0, 9.0, len(values))
     fold = exposure_folds(network.exposure, 3)
-    found = _held_out(_prior_of(terms, 0), part.values, values, weight, fold)
-    design = np.einsum('nm,ab->nabm', part.values, np.eye(2)).reshape(len(values), 2, -1)
     precision = prior_precision(part.functions, part.prior) + part.gauge
+    found = _held_out(precision, part.values, values, weight, fold)
+    design = np.einsum('nm,ab->nabm', part.values, np.eye(2)).reshape(len(values), 2, -1)
     expected = held_out_densely(design, precision, values, weight, fold)
     np.testing.assert_allclose(found, expected, atol=1e-4)
 

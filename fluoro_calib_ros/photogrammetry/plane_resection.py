@@ -22,20 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from ..findings import too_few
-from .noise import Noise
-from .resection import (
-    DLT_ITERATIONS,
-    MIN_FLATNESS,
-    MIN_TARGETS,
-    NU,
-    SAMPLES,
-    dlt_rows,
-    robust_variance,
-    squared_residuals,
-)
+from .resection import MIN_FLATNESS, robust_dlt
 
-SAMPLE_SIZE = 4  # a homography has 8 unknowns, and a target gives two equations
 # Smallest singular value of the conditions on the principal distance, over its largest possible
 # value, below which no plane is tilted enough: some 3 degrees in a beam of 15 degrees.
 MIN_TILT = 1e-3
@@ -70,56 +58,12 @@ def plane_of(xyz: NDArray[np.float64]) -> Plane:
     return Plane(centre, axes)
 
 
-def homography(
-    xy: NDArray[np.float64], uv: NDArray[np.float64], weights: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
-    """Return homographies (..., 3, 3), uv ~ H (xy, 1), by the direct linear transformation.
-
-    xy (..., n, 2), uv (..., n, 2) and weights (..., n) of n >= 4 points. Coordinates are
-    normalised (Hartley and Zisserman, algorithm 4.2).
-    """
-    x, from_x = _normalised(xy)
-    u, from_u = _normalised(uv)
-    rows = dlt_rows(x, u, weights)
-    _, vectors = np.linalg.eigh(np.swapaxes(rows, -1, -2) @ rows)
-    normalised = vectors[..., 0].reshape(vectors.shape[:-2] + (3, 3))
-    return from_u @ normalised @ np.linalg.inv(from_x)
-
-
-def _normalised(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return points (..., n, 2) centred and scaled to about one, and the matrix back."""
-    mean = points.mean(axis=-2, keepdims=True)
-    square = np.mean(np.sum((points - mean) ** 2, axis=-1), axis=-1)[..., None, None]
-    size = np.sqrt(np.maximum(square, 1e-300) / 2)
-    denormalisation = np.zeros(points.shape[:-2] + (3, 3))
-    denormalisation[..., [0, 1], [0, 1]] = size[..., 0]
-    denormalisation[..., :2, 2] = mean[..., 0, :]
-    denormalisation[..., 2, 2] = 1
-    return (points - mean) / size, denormalisation
-
-
 def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the homography (3, 3) of targets with up to half false matches.
+    """Return the homography (3, 3), uv ~ H (xy, 1), of targets with up to half false matches.
 
-    The sample with the least median of squared residuals (Rousseeuw 1984) is refined on all points
-    with robust weights. xy (n, 2) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError if
-    there are too few targets, or their image points lie on a line.
+    xy (n, 2) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError as robust_dlt.
     """
-    if len(xy) < MIN_TARGETS:
-        raise DataError(f'{too_few(len(xy), "target")} for a resection, {MIN_TARGETS} are needed')
-    spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
-    if spread[1] <= MIN_FLATNESS * spread[0]:
-        raise DataError('all image points are collinear or coincide')
-    rng = np.random.default_rng(0)
-    samples = np.argsort(rng.random((SAMPLES, len(xy))), axis=1)[:, :SAMPLE_SIZE]
-    candidates = homography(xy[samples], uv[samples])
-    squared = squared_residuals(candidates, xy, uv)
-    best = squared[np.argmin(np.median(squared, axis=1))]
-    for _ in range(DLT_ITERATIONS):
-        weights = Noise(nu=NU).weight(best / robust_variance(best))
-        h = homography(xy, uv, weights)
-        best = squared_residuals(h, xy, uv)
-    return h
+    return robust_dlt(xy, uv)
 
 
 def principal_distance_of_planes(

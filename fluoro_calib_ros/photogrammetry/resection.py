@@ -4,7 +4,7 @@
 """Resection: exterior orientation of one exposure from the phantom, without initial values.
 
 The direct linear transformation (Abdel-Aziz and Karara 1971; Hartley and Zisserman, "Multiple View
-Geometry", 2nd ed., 2004, 7.1 and 6.2) is computed from random samples. The one with the least
+Geometry", 2nd ed., 2004, 4.1 and 7.1) is computed from random samples. The one with the least
 median of squared residuals is selected (Rousseeuw 1984), and refined on all points with robust
 weights.
 """
@@ -27,9 +27,15 @@ from .rotations import matrix_from_vector
 
 MIN_TARGETS = 8  # two more than the DLT needs
 SAMPLE_SIZE = 6  # the DLT has 11 unknowns, and a target gives two equations
+PLANE_SAMPLE_SIZE = 4  # a homography has 8 unknowns
 SAMPLES = 200  # with 20 % false matches 1 - (1 - 0.8^6)^200: a good sample is certain
 # Targets with a smaller ratio of smallest to largest extent are considered to lie in one plane.
 MIN_FLATNESS = 1e-2
+# Errors of such targets, by the dimension that they should have.
+FLATTENED = {
+    2: 'all targets are collinear',
+    3: 'all targets are coplanar: the principal distance is undetermined',
+}
 DLT_ITERATIONS = 10
 SETTLED_WEIGHTS = 0.02  # change of the robust weights at convergence
 NU = 3.0  # degrees of freedom of the Student-t of the robust weights: heavy tails
@@ -73,35 +79,17 @@ def least_vectors_with_last_one(forms: NDArray[np.float64]) -> NDArray[np.float6
     return np.concatenate([components[..., 0], np.ones_like(components[..., :1, 0])], axis=-1)
 
 
-def dlt_rows(
-    x: NDArray[np.float64], u: NDArray[np.float64], weights: NDArray[np.float64] | None
-) -> NDArray[np.float64]:
-    """Return rows (..., 2n, 3 (k + 1)) of u ~ P (x, 1) in P: x (..., n, k), u (..., n, 2)."""
-    x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
-    zero = np.zeros_like(x1)
-    rows = np.concatenate(
-        [
-            np.concatenate([x1, zero, -u[..., :1] * x1], axis=-1),
-            np.concatenate([zero, x1, -u[..., 1:] * x1], axis=-1),
-        ],
-        axis=-2,
-    )
-    if weights is not None:
-        rows = rows * np.sqrt(np.concatenate([weights, weights], axis=-1))[..., None]
-    return rows
-
-
 def direct_linear_transformation(
     xyz: NDArray[np.float64],
     uv: NDArray[np.float64],
     weights: NDArray[np.float64] | None = None,
     least: Callable[[NDArray[np.float64]], NDArray[np.float64]] = least_vectors,
 ) -> NDArray[np.float64]:
-    """Return projection matrices (..., 3, 4) with uv ~ P (xyz, 1).
+    """Return projections (..., 3, k + 1) with uv ~ P (xyz, 1) of points in space or in a plane.
 
-    xyz (..., n, 3), uv (..., n, 2) and weights (..., n) of n >= 6 points. Coordinates are
-    normalised (Hartley and Zisserman, algorithm 7.1). least: returns vectors (..., 12) that
-    minimise quadratic forms (..., 12, 12).
+    xyz (..., n, k), uv (..., n, 2) and weights (..., n) of n >= 6 points in space (k = 3), or
+    n >= 4 in a plane (k = 2). Coordinates are normalised (Hartley and Zisserman, algorithms 4.2
+    and 7.1). least: returns vectors (..., 3 k + 3) that minimise quadratic forms.
     """
     return _dlt_of_weights(xyz, uv, least)(weights)
 
@@ -112,30 +100,44 @@ def _dlt_of_weights(
     least: Callable[[NDArray[np.float64]], NDArray[np.float64]] = least_vectors,
 ) -> Callable[[NDArray[np.float64] | None], NDArray[np.float64]]:
     """Return `direct_linear_transformation` of these points as a function of their weights."""
-    mean_x = xyz.mean(axis=-2, keepdims=True)
-    mean_u = uv.mean(axis=-2, keepdims=True)
-    scale_x = np.sqrt(3 / np.mean(np.sum((xyz - mean_x) ** 2, axis=-1), axis=-1))[..., None, None]
-    scale_u = np.sqrt(2 / np.mean(np.sum((uv - mean_u) ** 2, axis=-1), axis=-1))[..., None, None]
-    x = (xyz - mean_x) * scale_x
-    u = (uv - mean_u) * scale_u
-    rows = dlt_rows(x, u, None)
-    to_x = np.zeros(xyz.shape[:-2] + (4, 4))
-    to_x[..., range(3), range(3)] = scale_x[..., 0]
-    to_x[..., :3, 3] = -(scale_x * mean_x)[..., 0, :]
-    to_x[..., 3, 3] = 1
-    from_u = np.zeros(xyz.shape[:-2] + (3, 3))
-    from_u[..., [0, 1], [0, 1]] = 1 / scale_u[..., 0]
-    from_u[..., :2, 2] = mean_u[..., 0, :]
-    from_u[..., 2, 2] = 1
+    x, to_x = _normalised(xyz)
+    u, to_u = _normalised(uv)
+    zero = np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.concatenate([x, zero, -u[..., :1] * x], axis=-1),
+            np.concatenate([zero, x, -u[..., 1:2] * x], axis=-1),
+        ],
+        axis=-2,
+    )
+    from_u = np.linalg.inv(to_u)
 
     def projections(weights: NDArray[np.float64] | None) -> NDArray[np.float64]:
         weighted = rows
         if weights is not None:
             weighted = rows * np.concatenate([weights, weights], axis=-1)[..., None]
         vectors = least(np.swapaxes(rows, -1, -2) @ weighted)
-        return from_u @ vectors.reshape(vectors.shape[:-1] + (3, 4)) @ to_x
+        return from_u @ vectors.reshape(*vectors.shape[:-1], 3, -1) @ to_x
 
     return projections
+
+
+def _normalised(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centre and scale points (..., n, k) to about one.
+
+    Returns homogeneous coordinates (..., n, k + 1) and the transformation (..., k + 1, k + 1).
+    """
+    k = points.shape[-1]
+    mean = points.mean(axis=-2)
+    square = np.mean(np.sum((points - mean[..., None, :]) ** 2, axis=-1), axis=-1)
+    scale = np.sqrt(k / np.maximum(square, 1e-300))[..., None]
+    transformation = np.zeros((*mean.shape[:-1], k + 1, k + 1))
+    transformation[..., range(k), range(k)] = scale
+    transformation[..., :k, k] = -scale * mean
+    transformation[..., k, k] = 1
+    homogeneous = np.ones((*points.shape[:-1], k + 1))
+    homogeneous[..., :k] = (points - mean[..., None, :]) * scale[..., None]
+    return homogeneous, transformation
 
 
 def decompose(
@@ -179,23 +181,24 @@ def robust_variance(squared: NDArray[np.float64]) -> float:
 
 
 def robust_dlt(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the projection matrix (3, 4) of targets with up to half false matches.
+    """Return the projection (3, k + 1) of targets with up to half false matches.
 
-    xyz (n, 3) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError if there are too few
-    targets, or they lie in one plane.
+    xyz (n, 3) in space, or (n, 2) in a plane [mm], and uv (n, 2) [px] of n >= 8 targets. Raises
+    DataError if there are too few targets, or if they or their image points are degenerate.
     """
     if len(xyz) < MIN_TARGETS:
         raise DataError(f'{too_few(len(xyz), "target")} for a resection, {MIN_TARGETS} are needed')
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if not extent[0] > MIN_EXTENT_MM:
         raise DataError('all targets coincide')
-    if extent[2] < MIN_FLATNESS * extent[0]:
-        raise DataError('all targets are coplanar: the principal distance is undetermined')
+    if extent[-1] < MIN_FLATNESS * extent[0]:
+        raise DataError(FLATTENED[len(extent)])
     spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_FLATNESS * spread[0]:
         raise DataError('all image points are collinear or coincide')
     rng = np.random.default_rng(0)
-    samples = np.argpartition(rng.random((SAMPLES, len(xyz))), SAMPLE_SIZE)[:, :SAMPLE_SIZE]
+    size = SAMPLE_SIZE if len(extent) == 3 else PLANE_SAMPLE_SIZE
+    samples = np.argpartition(rng.random((SAMPLES, len(xyz))), size)[:, :size]
     candidates = direct_linear_transformation(
         xyz[samples], uv[samples], least=least_vectors_with_last_one
     )

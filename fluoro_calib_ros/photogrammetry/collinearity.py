@@ -292,24 +292,6 @@ class AdditionalParameters:
             out += self._grouped_covariance(self.grouped, covariance, part)
         return out
 
-    def correction_variance(
-        self, covariance: NDArray[np.float64], part: slice = ALL
-    ) -> NDArray[np.float64]:
-        """Return traces (n,) [px^2] of `correction_covariance`, at half to a third of its cost."""
-        common = covariance[: self._common, : self._common]
-        if self.functions.ndim == 2:
-            f = self.functions[part]
-            k = f.shape[1]
-            out = np.einsum('np,np->n', f @ (common[:k, :k] + common[k:, k:]), f)
-        else:
-            out = np.zeros(len(self.functions[part]))
-            for f, _ in self._by_axis():
-                out += np.einsum('np,np->n', f[part] @ common, f[part])
-        if self.grouped is not None:
-            own_covariance = self._grouped_covariance(self.grouped, covariance, part)
-            out += np.trace(own_covariance, axis1=1, axis2=2)
-        return out
-
     def _grouped_covariance(
         self, grouped: GroupedFunctions, covariance: NDArray[np.float64], part: slice
     ) -> NDArray[np.float64]:

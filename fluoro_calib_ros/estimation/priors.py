@@ -21,6 +21,7 @@ from scipy.linalg import cho_factor, cho_solve, lapack
 from ..correction.series import Functions
 from ..correction.terms import ABSENT_VARIANCE, trend_transformation
 from ..photogrammetry.noise import SURE
+from ..photogrammetry.rotations import mirror_lower
 from .estimator import GaugeKind, gauge_rows
 from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_likely_places
 from .parametric import covariance_with_uncertain_terms
@@ -190,8 +191,7 @@ def _posterior(
     """Return coefficients (2m,) and their covariance (2m, 2m); information includes the gauge."""
     precision = information + prior_precision(functions, prior)
     factor, _ = cho_factor(precision, lower=True)
-    half, _ = lapack.dpotri(factor, lower=1)
-    covariance = np.tril(half) + np.tril(half, -1).T
+    covariance = mirror_lower(lapack.dpotri(factor, lower=1)[0])
     return covariance @ right, covariance
 
 

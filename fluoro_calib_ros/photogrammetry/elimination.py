@@ -108,7 +108,7 @@ class BorderedFactor:
         k, size = self.inverse.shape[:2]
         q = len(self.schur)
         lower, _ = lapack.dpotri(self.schur, lower=1)
-        remaining = mirror_lower(lower).T  # stored by rows
+        remaining = mirror_lower(lower)
         transposed = self.inverse.transpose(0, 2, 1)
         gain = transposed @ self.half_border.reshape(k, size, q)
         border = -(gain.reshape(-1, q) @ remaining).reshape(k, size, q)

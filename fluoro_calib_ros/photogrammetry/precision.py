@@ -21,7 +21,6 @@ from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, 
 from .network import Gauge, Network, STransformation
 from .noise import Noise
 from .normal_equations import CHUNK, MIN_WEIGHT, NormalEquations, normal_equations, right_sides
-from .rotations import square_of_lower
 from .unknowns import Parameters, UnknownVector, discrepancies_with_jacobian
 
 # Largest number of object points whose joint covariance is stored. The more there are, the less it
@@ -110,7 +109,8 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> NDArray
     additional = layout.all_additional
     size = additional.stop - additional.start  # all of them are free
     last = slice(len(matrix.factor.schur) - size, None)
-    information = square_of_lower(matrix.factor.schur[last, last])
+    factor = np.tril(matrix.factor.schur[last, last])
+    information = factor @ factor.T
     columns = layout.additional[f]
     selected = np.arange(columns.start, columns.stop) - additional.start
     eliminated = np.setdiff1d(np.arange(size), selected)

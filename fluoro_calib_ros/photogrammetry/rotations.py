@@ -17,34 +17,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import blas
-
-# Symmetric matrices with only one triangle given.
-
-BLOCK = 128  # rows and columns handled at once, so that they stay in the cache
 
 
 def mirror_lower(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Copy the lower triangle of a matrix (n, n) to its upper triangle in place, and return it."""
-    n = len(matrix)
-    for start in range(0, n, BLOCK):
-        stop = min(start + BLOCK, n)
-        matrix[start:stop, stop:] = matrix[stop:, start:stop].T
-        block = np.tril(matrix[start:stop, start:stop])
-        matrix[start:stop, start:stop] = block + np.tril(block, -1).T
-    return matrix
-
-
-def square_of_lower(factor: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return L L^T (n, n) of a lower triangular L; the upper triangle of factor is ignored."""
-    n = len(factor)
-    out = np.zeros((n, n), order='F')
-    for start in range(0, n, BLOCK):
-        stop = min(start + BLOCK, n)
-        columns = np.array(factor[start:, start:stop], order='F')
-        columns[: stop - start] = np.tril(columns[: stop - start])
-        out[start:, start:] += blas.dsyrk(1.0, columns, lower=1)
-    return mirror_lower(out)
+    """Return the symmetric matrix (n, n) whose lower triangle is that of a matrix."""
+    return np.tril(matrix) + np.tril(matrix, -1).T
 
 
 # Tolerance of R^T R - I for matrices in files: three decimals leave an error of half a thousandth.

@@ -19,10 +19,11 @@ from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import MIN_RAYS
 from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.precision import covariance_blocks
+from ..photogrammetry.precision import covariance_blocks, covariance_of_exteriors
 from ..photogrammetry.unknowns import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
+    Parameters,
     RelativeConstraint,
     RelativePose,
     discrepancies,
@@ -229,7 +230,7 @@ def relative_orientations(
             pairs = paired_exposures(measured, b)
             if not len(pairs):
                 continue
-            pose, covariance = _mean_of_pairs(run, pairs)
+            pose, covariance = _mean_of_run(run, pairs)
         else:
             pairs = measured.network.relative[b - 1].pairs
             pose = parameters.relative[b - 1]
@@ -250,7 +251,7 @@ def relative_orientations(
     return tuple(out)
 
 
-def _mean_of_pairs(
+def _mean_of_run(
     run: SelfCalibration, pairs: NDArray[np.int64]
 ) -> tuple[RelativePose, NDArray[np.float64]]:
     """Return the weighted mean of relative orientations of pairs (k, 2), and covariance (6, 6).
@@ -267,20 +268,34 @@ def _mean_of_pairs(
         after.noise,
         after.noise.information_factor(after.q),
     )
-    blocks = covariance_blocks(factorize(network, equations))
-    pose = mean_pose(after.parameters, pairs)
-    _, d_a, d_b, _ = discrepancies_with_jacobian(
-        RelativeConstraint((0, 1), pairs, 1.0, 1.0), pose, after.parameters
-    )
-    count = len(pairs)
-    i, j = (a.ravel() for a in np.indices((count, count)))
-    mixed: NDArray[np.float64] = np.zeros(())
-    for p, d_p in zip(pairs.T, (d_a, d_b)):
-        for q, d_q in zip(pairs.T, (d_a, d_b)):
-            between = blocks.between(p[i], q[j])
-            mixed = mixed + d_p[i] @ between @ d_q[j].transpose(0, 2, 1)
-    mixed = mixed.reshape(count, count, 6, 6)
-    weights = np.linalg.inv(mixed[np.arange(count), np.arange(count)])
-    inverse = np.linalg.inv(weights.sum(axis=0))
-    middle = np.einsum('kab,klbc,lcd->ad', weights, mixed, weights)
-    return mean_pose(after.parameters, pairs, weights), inverse @ middle @ inverse
+    covariance = covariance_of_exteriors(covariance_blocks(factorize(network, equations)))
+    derivatives = derivatives_of_pairs(after.parameters, pairs)
+    weights = np.linalg.inv(derivatives @ covariance @ derivatives.transpose(0, 2, 1))
+    pose, operator = mean_of_pairs(after.parameters, pairs, derivatives, weights)
+    return pose, operator @ covariance @ operator.T
+
+
+def derivatives_of_pairs(parameters: Parameters, pairs: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return derivatives (k, 6, 6m) of relative orientations of pairs (k, 2) by m exposures."""
+    constraint = RelativeConstraint((0, 1), pairs, 1.0, 1.0)
+    start = mean_pose(parameters, pairs)
+    _, d_a, d_b, _ = discrepancies_with_jacobian(constraint, start, parameters)
+    count = np.arange(len(pairs))
+    out = np.zeros((len(pairs), 6, len(parameters.rotation), 6))
+    out[count, :, pairs[:, 0]] = d_a
+    out[count, :, pairs[:, 1]] = d_b
+    return out.reshape(len(pairs), 6, -1)
+
+
+def mean_of_pairs(
+    parameters: Parameters,
+    pairs: NDArray[np.int64],
+    derivatives: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> tuple[RelativePose, NDArray[np.float64]]:
+    """Return the mean of relative orientations of pairs (k, 2) with weights (k, 6, 6).
+
+    derivatives: see `derivatives_of_pairs`. Also returns those (6, 6m) of the mean.
+    """
+    operator = np.linalg.solve(weights.sum(axis=0), (weights @ derivatives).sum(axis=0))
+    return mean_pose(parameters, pairs, weights), operator

@@ -20,7 +20,7 @@ are intersected afterwards; C_ei describes this.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -35,11 +35,13 @@ from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
-from ..photogrammetry.elimination import CovarianceBlocks, factorize
-from ..photogrammetry.network import Network
+from ..photogrammetry.elimination import factorize
 from ..photogrammetry.noise import CERTAIN
-from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.precision import covariance_blocks
+from ..photogrammetry.precision import (
+    covariance_blocks,
+    covariance_of_exteriors,
+    equations_with_fixed_interiors,
+)
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
 from ..photogrammetry.rotations import matrix_from_quaternion, nearest_rotation
 from ..photogrammetry.unknowns import (
@@ -47,11 +49,9 @@ from ..photogrammetry.unknowns import (
     RIGID_SD_RAD,
     RelativeConstraint,
     RelativePose,
-    discrepancies_with_jacobian,
-    mean_pose,
     relative_poses,
 )
-from .constraints import paired_exposures
+from .constraints import derivatives_of_pairs, mean_of_pairs, paired_exposures
 from .fixed_calibration import (
     fixed_corrections,
     network_of_calibrations,
@@ -128,26 +128,10 @@ class _FixedAdjustment:
 
     measured: Measured
     after: Adjustment
-    #: (m, 6, 3F) derivatives de/di of the exteriors by the interiors
+    #: (6m, 3F) derivatives de/di of the exteriors by the interiors
     by_interior: NDArray[np.float64]
-    blocks: CovarianceBlocks  #: blocks of the adjustment with the interiors among the unknowns
+    covariance: NDArray[np.float64]  #: (6m, 6m) of the exteriors, for known interiors
     interiors: NDArray[np.float64]  #: (3F, 3F) covariance of the interiors
-
-    def covariance(self, e: NDArray[np.int64], f: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return covariances (k, 6, 6) of exposures e (k,) with f (k,), for known interiors."""
-        derivative = self.by_interior
-        from_interiors = derivative[e] @ self.blocks.gg @ derivative[f].transpose(0, 2, 1)
-        return self.blocks.between(e, f) - from_interiors
-
-    def covariance_of_all(self) -> NDArray[np.float64]:
-        """Return the covariance (6m, 6m) of all exposures, for known interiors."""
-        count = len(self.measured.frames)
-        exposures = np.arange(count)
-        rows = [
-            self.covariance(np.full(count, e), exposures).transpose(1, 0, 2).reshape(6, 6 * count)
-            for e in exposures
-        ]
-        return np.concatenate(rows)
 
 
 @dataclass(frozen=True)
@@ -208,14 +192,9 @@ def orientation_of_capture(
     with threadpool_limits(1):
         measured = network_of_calibrations(standing, phantom, calibrations)
         fixed = _adjusted(measured, calibrations, True)
-        known = fixed.covariance_of_all()
     parameters = fixed.after.parameters
-    count = len(frames)
     exteriors = _Exteriors(
-        parameters.rotation,
-        parameters.position_mm,
-        known,
-        fixed.by_interior.reshape(6 * count, -1),
+        parameters.rotation, parameters.position_mm, fixed.covariance, fixed.by_interior
     )
     exposures = min(len(captured) for captured in frames.values())
     origin = _Origin(frame_id, 'capture', _last_stamp(frames), exposures)
@@ -285,13 +264,13 @@ def _relative_to_first(
             raise DataError(_unpaired(names, b))
         rows = slice(6 * b, 6 * b + 6)
         corrected = names[0] in turning or names[b] in turning
-        pose, operator[rows], pair_scatter = _mean_of_pairs(fixed, pairs, corrected)
+        pose, operator[rows], pair_scatter = _mean_and_scatter(fixed, pairs, corrected)
         growth[rows] = pair_scatter.growth
         rotation[b] = pose.rotation
         position[b] = pose.translation_mm
         scatter.append(pair_scatter)
-    known = growth[:, None] * (operator @ fixed.covariance_of_all() @ operator.T) * growth
-    by_interior = operator @ fixed.by_interior.reshape(operator.shape[1], -1)
+    known = growth[:, None] * (operator @ fixed.covariance @ operator.T) * growth
+    by_interior = operator @ fixed.by_interior
     return _Exteriors(rotation, position, known, by_interior), tuple(scatter)
 
 
@@ -446,31 +425,18 @@ def _adjusted(
     )
     if not np.isfinite(after.parameters.position_mm).all():
         raise DataError('the exposures do not determine the orientation of the fluoroscopes')
-    blocks = _with_free_interiors(network, after, correction)
-    by_interior = blocks.eg @ np.linalg.inv(blocks.gg)
+    # With standard deviations of 1 px, the normal matrix of the interiors can be inverted even if
+    # one pose of the phantom does not determine them. The derivative does not depend on them.
+    unit = np.tile(np.eye(3), (len(known), 1, 1))
+    free, equations = equations_with_fixed_interiors(network, after, correction, unit)
+    blocks = covariance_blocks(factorize(free, equations))
+    by_interior = blocks.eg.reshape(-1, len(blocks.gg)) @ np.linalg.inv(blocks.gg)
+    covariance = covariance_of_exteriors(blocks) - by_interior @ blocks.gg @ by_interior.T
     interior_covariance = block_diag(*(calibration.interior_covariance for calibration in known))
-    return _FixedAdjustment(measured, after, by_interior, blocks, interior_covariance)
+    return _FixedAdjustment(measured, after, by_interior, covariance, interior_covariance)
 
 
-def _with_free_interiors(
-    network: Network, after: Adjustment, correction: NDArray[np.float64]
-) -> CovarianceBlocks:
-    """Return covariances of an adjustment with the interiors as further unknowns."""
-    count = network.n_fluoroscopes
-    # With a standard deviation of 1 px, their normal matrix can be inverted even if one pose of
-    # the phantom does not determine them. The derivative de/di does not depend on this value.
-    free = replace(
-        network,
-        interior_free=np.ones(count, dtype=bool),
-        interior_mean=after.parameters.interior,
-        interior_sd=np.ones((count, 3)),
-    )
-    factor = after.noise.information_factor(after.q)
-    equations = normal_equations(free, after.parameters, correction, after.noise, factor)
-    return covariance_blocks(factorize(free, equations))
-
-
-def _mean_of_pairs(
+def _mean_and_scatter(
     fixed: _FixedAdjustment, pairs: NDArray[np.int64], corrected: bool
 ) -> tuple[RelativePose, NDArray[np.float64], PairScatter]:
     """Return the weighted mean of the relative orientations of pairs (k, 2) of exposures.
@@ -483,19 +449,12 @@ def _mean_of_pairs(
     pairs = pairs[np.argsort([frames[row].number for row in pairs[:, 0]], kind='stable')]
     angles = [angles_of(frames[row] for row in rows) for rows in pairs.T]
     constraint = RelativeConstraint((0, 1), pairs, 1.0, 1.0)
-    start = mean_pose(parameters, pairs)
-    _, d_a, d_b, _ = discrepancies_with_jacobian(constraint, start, parameters)
-    weights = np.linalg.inv(_covariance_of_pairs(fixed, pairs, d_a, d_b))
+    derivatives = derivatives_of_pairs(parameters, pairs)
+    weights = np.linalg.inv(derivatives @ fixed.covariance @ derivatives.transpose(0, 2, 1))
     columns = functions_of_angles(angles)
     agreement = agreeing(parameters, constraint, weights, columns)
     used = agreement.used
-    pose = mean_pose(parameters, pairs[used], weights[used])
-    operator = np.zeros((6, len(fixed.measured.frames), 6))
-    share = np.linalg.solve(
-        weights[used].sum(axis=0), weights[used].transpose(1, 0, 2).reshape(6, -1)
-    ).reshape(6, -1, 6)
-    for rows, derivative in zip(pairs[used].T, (d_a[used], d_b[used])):
-        operator[:, rows] += np.einsum('ika,kab->ikb', share, derivative)
+    pose, operator = mean_of_pairs(parameters, pairs[used], derivatives[used], weights[used])
     poses = [pose.updated(step) for step in agreement.trend]
     network = fixed.measured.network
     by_angle = displacements(network, parameters, pairs, poses, [pose] * len(poses))
@@ -514,27 +473,7 @@ def _mean_of_pairs(
         turn=turn,
         shift_mm=shift,
     )
-    return pose, operator.reshape(6, -1), scatter
-
-
-def _covariance_of_pairs(
-    fixed: _FixedAdjustment,
-    pairs: NDArray[np.int64],
-    d_a: NDArray[np.float64],
-    d_b: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return covariances (k, 6, 6) of the relative orientations of pairs (k, 2) of exposures.
-
-    d_a, d_b: (k, 6, 6) their derivatives by the exposures.
-    """
-    a, b = pairs.T
-    mixed = d_a @ fixed.covariance(a, b) @ d_b.transpose(0, 2, 1)
-    return (
-        d_a @ fixed.covariance(a, a) @ d_a.transpose(0, 2, 1)
-        + d_b @ fixed.covariance(b, b) @ d_b.transpose(0, 2, 1)
-        + mixed
-        + mixed.transpose(0, 2, 1)
-    )
+    return pose, operator, scatter
 
 
 def _orientation(

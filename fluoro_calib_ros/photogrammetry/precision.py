@@ -321,27 +321,33 @@ def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
     """Return joint covariances of all unknowns from blocks of an inverse normal matrix."""
     m = len(blocks.ee)
     n = len(blocks.pp)
-
-    def assembled(
-        of_pairs: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]],
-        rows: int,
-        columns: int,
-    ) -> NDArray[np.float64]:
-        i, j = (a.ravel() for a in np.indices((rows, columns)))
-        pair_blocks = of_pairs(i, j)
-        height, width = pair_blocks.shape[1:]
-        pair_blocks = pair_blocks.reshape(rows, columns, height, width).transpose(0, 2, 1, 3)
-        return pair_blocks.reshape(rows * height, columns * width)
-
     size = len(blocks.gg)
     return JointCovariance(
-        assembled(blocks.between, m, m),
-        assembled(blocks.points_between, n, n),
-        points_exteriors=assembled(lambda p, e: blocks.pe(e, p), n, m),
+        covariance_of_exteriors(blocks),
+        _assembled(blocks.points_between, n, n),
+        points_exteriors=_assembled(lambda p, e: blocks.pe(e, p), n, m),
         globals=blocks.gg,
         exteriors_globals=blocks.eg.reshape(-1, size),
         points_globals=blocks.pg.reshape(-1, size),
     )
+
+
+def covariance_of_exteriors(blocks: CovarianceBlocks) -> NDArray[np.float64]:
+    """Return the joint covariance (6m, 6m) of the exterior orientations."""
+    return _assembled(blocks.between, len(blocks.ee), len(blocks.ee))
+
+
+def _assembled(
+    of_pairs: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]],
+    rows: int,
+    columns: int,
+) -> NDArray[np.float64]:
+    """Return the matrix whose blocks of_pairs(i, j) have so many rows and columns of blocks."""
+    i, j = (a.ravel() for a in np.indices((rows, columns)))
+    pair_blocks = of_pairs(i, j)
+    height, width = pair_blocks.shape[1:]
+    pair_blocks = pair_blocks.reshape(rows, columns, height, width).transpose(0, 2, 1, 3)
+    return pair_blocks.reshape(rows * height, columns * width)
 
 
 def _relative_redundancy(

@@ -12,7 +12,7 @@ import rigs
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.constraints import (
-    _mean_of_pairs,
+    _mean_of_run,
     gauges_of,
     interiors_to_estimate,
     relative_orientations,
@@ -343,7 +343,7 @@ def test_covariance_of_a_mean_relative_orientation_equals_the_dense_one():
         d = derivatives(lambda parameters, k=k: off(parameters, middle)[k])
         weights.append(np.linalg.inv(d @ covariance[:36, :36] @ d.T))
     weights = np.array(weights)
-    pose, got = _mean_of_pairs(run, pairs)
+    pose, got = _mean_of_run(run, pairs)
     expected = mean_pose(after.parameters, pairs, weights)
     np.testing.assert_allclose(pose.translation_mm, expected.translation_mm, rtol=1e-4)
     np.testing.assert_allclose(pose.rotation, expected.rotation, atol=1e-5)

@@ -365,17 +365,17 @@ def test_many_exposures_are_thinned_evenly():
 def test_corrections_that_change_with_the_angle_of_either_fluoroscope_count(monkeypatch, turning):
     told = []
 
-    def mean_of_pairs(fixed, pairs, corrected):
+    def mean_and_scatter(fixed, pairs, corrected):
         told.append(corrected)
         pose = Fake(rotation=np.eye(3), translation_mm=np.zeros(3))
         return pose, np.zeros((6, 12)), Fake(growth=np.ones(6))
 
-    monkeypatch.setattr(rig_orientation, '_mean_of_pairs', mean_of_pairs)
+    monkeypatch.setattr(rig_orientation, '_mean_and_scatter', mean_and_scatter)
     monkeypatch.setattr(rig_orientation, 'paired_exposures', lambda measured, b: [(0, 1)])
     fixed = Fake(
         measured=Fake(fluoroscopes=('a', 'b'), frames=[None, None]),
-        covariance_of_all=lambda: np.eye(12),
-        by_interior=np.zeros((12, 2, 3)),
+        covariance=np.eye(12),
+        by_interior=np.zeros((12, 6)),
     )
     rig_orientation._relative_to_first(fixed, turning)
     assert told == [bool(turning)]

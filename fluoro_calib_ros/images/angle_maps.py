@@ -37,7 +37,7 @@ from .corrector import (
 
 NODE_PX = 8  # distance between nodes at which the change is iterated
 STEPS = 3  # iterations; each leaves the fraction by which the change differs per pixel
-TURN = np.deg2rad(np.arange(360.0))  # angles at which the rate of change is measured
+TURN = np.deg2rad(np.arange(360.0))  # angles at which the change and its rate are measured
 SIDE = 17  # side of the grid of pixels at which it is measured
 MIN_RATE = 1e-3  # rate of change of a pixel [px/rad] below which one map serves all angles
 
@@ -256,13 +256,17 @@ class _AtAngle:
 
 
 def _rate(field: AngleField) -> tuple[float, float]:
-    """Return the largest rate of change of a pixel [px/rad] and the largest change [px]."""
+    """Return the largest rate of change of a pixel [px/rad] and the largest change [px].
+
+    Beyond the angles that the field covers, its change is extrapolated without a limit.
+    """
     width, height = field.image_size
     u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, SIDE), np.linspace(-0.5, height - 0.5, SIDE))
     uv = np.column_stack([u.ravel(), v.ravel()])
     changes = np.array([field.change(uv, float(angle))[0] for angle in TURN])
     rates = np.diff(changes, axis=0, append=changes[:1]) / (TURN[1] - TURN[0])
-    return _longest(rates), _longest(changes)
+    covered = field.covers(TURN)
+    return _longest(rates[covered]), _longest(changes[covered])
 
 
 def _longest(vectors: NDArray[np.float64]) -> float:

@@ -12,10 +12,11 @@ import rigs
 import turning_rig
 
 from benchmarks.bead_images import bead_image
+from fluoro_calib_ros.correction.angle_field import AngleField, harmonics
 from fluoro_calib_ros.correction.base import CorrectionStatus
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.images.angle_maps import AngleMaps
+from fluoro_calib_ros.images.angle_maps import AngleMaps, _rate
 from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
 
 OK, OUTSIDE, INVALID = CorrectionStatus
@@ -115,6 +116,19 @@ def test_image_far_from_all_calibrated_angles_is_outside():
     corrector = maps().at(np.deg2rad(80.0))
     assert set(np.unique(corrector.status)) <= {OUTSIDE, INVALID}
     assert corrector.mask.mean() > 0.9
+
+
+def test_maps_are_for_the_angles_that_are_covered():
+    """Between -10 and 10 degrees a field changes by some pixels, far beyond by hundreds."""
+    angles = np.deg2rad(np.linspace(-10, 10, 15))
+    shape = harmonics(angles) - harmonics(angles).mean(axis=0)
+    coefficients = np.random.default_rng(0).normal(size=(4, 2, 10))
+    coefficients *= 0.3 / np.sqrt(np.mean(shape**2, axis=0))[:, None, None]
+    field = AngleField(SIZE, angles, coefficients, np.zeros((14, 33, 33)))
+    corners = np.array([[0.0, 0], [511, 0], [0, 511], [511, 511]])
+    reached = max(np.abs(field.change(corners, angle)[0]).max() for angle in angles)
+    _, largest = _rate(field)
+    assert reached < largest < 15 * reached
 
 
 def test_unknown_interpolation_is_refused():

@@ -280,7 +280,7 @@ def calibrate_by_regression(
         trained=regressions.inliers(),
         models=regressions.models(rounds.state.values, terms, after, precise),
         history=tuple(history.rounds),
-        converged=converged,
+        converged=converged and after.converged,
     )
 
 

@@ -43,6 +43,7 @@ from .estimator import (
     Estimator,
     RegressionStep,
     TrainingPoints,
+    exposure_folds,
     gauge_basis,
     gauge_coefficients,
     require_training,
@@ -121,18 +122,16 @@ class UserRegression(RegressionStep[LookupModel]):
         self, values: NDArray[np.float64], q: NDArray[np.float64], information: NDArray[np.float64]
     ) -> None:
         """Update the inliers, and compute G by cross-validation over exposures."""
-        from sklearn.model_selection import GroupKFold, cross_val_predict
+        from sklearn.model_selection import PredefinedSplit, cross_val_predict
 
         inliers = self._updated_inliers(q)
         require_training(int(inliers.sum()))
         self.inliers = inliers
-        groups = self.points.exposure[inliers]
         held_out = cross_val_predict(
             self._regressor,
             self._features(self.points.uv[inliers]),
             values[inliers],
-            groups=groups,
-            cv=GroupKFold(min(CV_FOLDS, len(np.unique(groups)))),
+            cv=PredefinedSplit(exposure_folds(self.points.exposure[inliers], CV_FOLDS)),
         )
         error = values[inliers] - held_out
         self.score = float(weighted_square_sum(error[None], information[inliers])[0])

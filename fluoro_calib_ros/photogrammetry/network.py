@@ -99,7 +99,7 @@ class Network:
         """Number of scalar observations, without priors of the global unknowns."""
         survey = self.survey_mm.size if self.datum == 'survey' else 0
         constraints = POSE_SIZE * sum(len(r.pairs) for r in self.relative)
-        exterior = 0 if self.exterior is None else self.exterior.sd.size
+        exterior = 0 if self.exterior is None else int(np.isfinite(self.exterior.sd).sum())
         return 2 * self.n_image_points + survey + constraints + exterior
 
     @cached_property

@@ -116,7 +116,7 @@ def test_prior_of_an_exterior_orientation_is_weighted_as_it_should_be():
     pull = wanted @ (prior.weights[0] * -off)
     moved = found.parameters.position_mm[0] - free.parameters.position_mm[0]
     np.testing.assert_allclose(moved, pull[:3], atol=0.1 * np.abs(pull[:3]).max())
-    assert weighted.n_observations == network.n_observations + 18
+    assert weighted.n_observations == network.n_observations + 6  # of the known exposure
 
 
 def test_what_is_saved_is_looked_up_and_validated(outcome, motion, tmp_path):

@@ -3,21 +3,22 @@
 
 """From networks to results: rounds, choice of models, image point noise, and figures."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rigs
 from sklearn.linear_model import LinearRegression
-from sklearn.model_selection import GroupKFold, cross_val_predict
+from sklearn.model_selection import PredefinedSplit, cross_val_predict
 from sklearn.tree import DecisionTreeRegressor
 
 from fluoro_calib_ros.correction.neighbours import KnnModel, LocalLinearModel
 from fluoro_calib_ros.correction.registry import NoCorrection
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation import alternation, self_calibration
 from fluoro_calib_ros.estimation import calibrate as calibrating
-from fluoro_calib_ros.estimation import self_calibration
 from fluoro_calib_ros.estimation.alternation import Regressions, _information
 from fluoro_calib_ros.estimation.calibrate import (
     _calibrated_group,
@@ -33,7 +34,11 @@ from fluoro_calib_ros.estimation.estimator import (
     exposure_folds,
     gauge_basis,
 )
-from fluoro_calib_ros.estimation.initial_network import EarlierCalibration, StartValues
+from fluoro_calib_ros.estimation.initial_network import (
+    EarlierCalibration,
+    StartValues,
+    adjusted_with_precision,
+)
 from fluoro_calib_ros.estimation.neighbour_regression import CrossValidation, NeighbourRegression
 from fluoro_calib_ros.estimation.options import (
     CalibrationOptions,
@@ -291,6 +296,17 @@ def test_correction_of_rounds_is_that_of_their_model_and_estimated_terms(model):
     assert core.sum() > 0.9 * len(core)
 
 
+def test_a_calibration_whose_last_adjustment_does_not_converge_has_not_converged(monkeypatch):
+    def unconverged(*arguments, **options):
+        after, precise = adjusted_with_precision(*arguments, **options)
+        return replace(after, converged=False), precise
+
+    monkeypatch.setattr(alternation, 'adjusted_with_precision', unconverged)
+    frames = {'a': rigs.exposures()['a'][:6]}
+    options = CalibrationOptions(model='none')
+    assert not calibrating.calibrate(frames, rigs.rig().phantom, options).converged
+
+
 # ---- user-defined regressors
 
 
@@ -313,8 +329,7 @@ def test_score_of_a_user_regressor_is_that_of_held_out_exposures():
         DecisionTreeRegressor(max_depth=4, random_state=1),
         uv,
         values[inside],
-        groups=step.points.exposure[inside],
-        cv=GroupKFold(5),
+        cv=PredefinedSplit(exposure_folds(step.points.exposure[inside], 5)),
     )
     error = values[inside] - held_out
     assert step.score == pytest.approx(np.sum(error**2))
@@ -325,6 +340,18 @@ def test_score_of_a_user_regressor_is_that_of_held_out_exposures():
     outer = np.mean(error**2)
     assert model.noise_px == pytest.approx(np.sqrt((inner + outer) / 2))
     assert model.bias_px == pytest.approx(np.sqrt(max((outer - inner) / 2, 0)))
+
+
+def test_score_of_a_user_regressor_of_one_exposure_is_that_of_held_out_points():
+    uv, _, values = training()
+    points = TrainingPoints(uv, np.zeros(len(uv), dtype=int), SIZE, GaugeKind.FULL)
+    step = chosen(UserRegression(LinearRegression(), points), values, range(0, 450, 50))
+    inside = step.inliers
+    split = PredefinedSplit(np.arange(inside.sum()) % 5)
+    held_out = cross_val_predict(
+        LinearRegression(), features(uv[inside]), values[inside], cv=split
+    )
+    assert step.score == pytest.approx(np.sum((values[inside] - held_out) ** 2))
 
 
 @pytest.mark.parametrize('gauge', [GaugeKind.FULL, GaugeKind.NONE])

@@ -263,6 +263,23 @@ def iterated(
     return observed
 
 
+def observed_pixels(
+    calibration: FluoroscopeCalibration,
+    undistorted: NDArray[np.float64],
+    angle: float | None = None,
+) -> NDArray[np.float64]:
+    """Return observed pixels (2, n) of undistorted pixels (2, n) [px] at an angle [rad]."""
+    field = calibration.angle_field
+    if field is None or angle is None or np.isnan(angle):
+        return iterated(calibration.grid, undistorted)
+
+    def at_angle(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        nearest = np.clip(at, -0.5, _end(grid))
+        return as_at_rim(grid, nearest) + field.duv(nearest.T, angle).T
+
+    return iterated(calibration.grid, undistorted, at_angle)
+
+
 def as_at_rim(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return corrections (2, n) at pixels (2, n); off the image, those of the nearest pixel."""
     return grid.look_up(*np.clip(at, -0.5, _end(grid)))[0][:2]

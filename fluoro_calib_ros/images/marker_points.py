@@ -56,9 +56,12 @@ def shadow_points(shadows: Sequence[NDArray[np.float64]], rig: CalibratedRig) ->
     shadow, xyz = shadow[agree], points.xyz_mm[agree]
     for view in range(len(names)):
         open_rows = np.flatnonzero(shadow[:, view] < 0)
+        place = rig.project(view, xyz[open_rows])
+        is_before = np.isfinite(place).all(axis=1)
+        open_rows = open_rows[is_before]
         if not len(open_rows) or not len(shadows[view]):
             continue
-        _, nearest = cKDTree(shadows[view]).query(rig.project(view, xyz[open_rows]))
+        _, nearest = cKDTree(shadows[view]).query(place[is_before])
         extended = shadow[open_rows]
         extended[:, view] = nearest
         points, agree = rays.intersect(extended)

@@ -16,6 +16,7 @@ from ..bodies.motion import POSE
 from ..bodies.shapes import learned_shape
 from ..bodies.tracking import BodyTracker
 from ..correction.fluoroscope_calibration import Calibrations
+from ..photogrammetry.collinearity import project
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import (
     IntersectedPoints,
@@ -23,6 +24,7 @@ from ..reconstruction.intersection import (
     largest_lack_of_fit,
 )
 from ..reconstruction.reconstruct import IntersectedViews, MatchedViews
+from .corrector import observed_pixels
 from .markers import MarkerFrame
 
 AGREE = 4.0  # largest standardised deviation of rays, or members of a body, that belong together
@@ -107,9 +109,6 @@ class MarkerPlaces:
         return MarkerPlaces(self.xyz_mm + displacement, covariance + motion_covariance)
 
 
-STEPS = 3  # fixed-point iterations: the correction changes slowly
-
-
 @dataclass(frozen=True)
 class CalibratedRig:
     """Orientation and calibrations of fluoroscopes, and the angles of their C-arms [rad]."""
@@ -119,24 +118,16 @@ class CalibratedRig:
     angles: Mapping[str, float | None]
 
     def project(self, view: int, xyz_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return observed pixels (k, 2) of points (k, 3) in the rig frame [mm]; NaN stays NaN.
+        """Return observed pixels (k, 2) of points (k, 3) in the rig frame [mm].
 
-        view is the row of the fluoroscope in the orientation. The correction is a function of the
-        observed pixel, so it is found by fixed-point iteration; where it is not defined, it is 0.
+        view is the row of the fluoroscope in the orientation. NaN stays NaN, and points that are
+        not before the source are NaN.
         """
         rig = self.orientation
         name = rig.fluoroscopes[view]
-        xp, yp, c = rig.interior[view]
-        sensor = (xyz_mm - rig.position_mm[view]) @ rig.rotation[view].T
-        ideal = sensor[:, :2] * (c / sensor[:, 2:]) + np.array([xp, yp])
-        observed = ideal
-        for _ in range(STEPS):
-            u, v, _, _, _ = self.calibrations[name].correct_arrays(
-                observed[:, 0].copy(), observed[:, 1].copy(), angle=self.angles.get(name)
-            )
-            step = ideal - np.stack([u, v], axis=1)
-            observed = observed + np.where(np.isfinite(step), step, 0.0)
-        return observed
+        ideal = project(rig.rotation[view], rig.position_mm[view], xyz_mm, rig.interior[view])
+        angle = self.angles.get(name)
+        return observed_pixels(self.calibrations[name], ideal.T.copy(), angle).T
 
     def spread(
         self, view: int, xyz_mm: NDArray[np.float64], covariance: NDArray[np.float64]

@@ -277,7 +277,9 @@ class JoinedViews:
             uv_before = self._rig_before.project(view.view, previous.xyz_mm[rows])
             velocity = (uv - uv_before) / (frame - self._frame)
             sd = self._rig.spread(view.view, expected.xyz_mm[rows], expected.covariance[rows])
-            view.tracker.suggest(self._target_id[rows], uv, velocity, sd)
+            seen = np.isfinite(velocity).all(axis=1)  # before the source in both exposures
+            ids = self._target_id[rows[seen]]
+            view.tracker.suggest(ids, uv[seen], velocity[seen], sd[seen])
 
     def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> NDArray[np.bool_]:
         """Search the whole images for bodies with a lost pose, by their shapes.

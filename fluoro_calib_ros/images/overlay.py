@@ -48,12 +48,13 @@ def draw_overlay(
             pass  # the label shows the reason
         return _labelled(picture, [(reason or 'refused', REFUSED)])
     radius = extraction.imaging.profile.reach_px
-    explained = np.linalg.norm(
+    distance = np.linalg.norm(
         extraction.detections.uv[:, None] - extraction.match.predicted[None], axis=2
     )
-    for uv, distance in zip(extraction.detections.uv, explained.min(axis=1)):
-        if not distance < radius:
-            _square(picture, uv, factor, radius)
+    # Predictions of beads behind the source are NaN.
+    unexplained = extraction.detections.uv[~(distance < radius).any(axis=1)]
+    for uv in unexplained:
+        _square(picture, uv, factor, radius)
     for uv, overlapped in zip(extraction.uv, extraction.overlapped):
         colour = OVERLAPPED if overlapped else MATCHED
         cv2.circle(picture, _place(uv, factor), round(factor * radius), colour, 1, cv2.LINE_AA)
@@ -61,12 +62,11 @@ def draw_overlay(
         place = _place(refusal.uv, factor)
         cv2.drawMarker(picture, place, REFUSED, cv2.MARKER_TILTED_CROSS, round(2 * radius), 1)
     overlapped = int(extraction.overlapped.sum())
-    unexplained = int(np.count_nonzero(~(explained.min(axis=1) < radius)))
     lines = [
         (f'{len(extraction.bead) - overlapped} beads', MATCHED),
         (f'{overlapped} overlapped', OVERLAPPED),
         (f'{len(extraction.refused)} predicted, not measured', REFUSED),
-        (f'{unexplained} not of the phantom', UNEXPLAINED),
+        (f'{len(unexplained)} not of the phantom', UNEXPLAINED),
     ]
     return _labelled(picture, lines)
 

@@ -3,12 +3,13 @@
 
 """Lattices against a count of all shifts, pictures by pixel, and predictions between views."""
 
+from dataclasses import replace
 from types import SimpleNamespace as Fake
 
 import cv2
 import numpy as np
 import pytest
-from rigs import true_calibrations, true_orientation
+from rigs import pincushion, true_calibrations, true_orientation
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body
@@ -133,6 +134,22 @@ def test_a_large_image_is_reduced_and_a_small_one_is_not():
 
 def colours_at(picture, u, v):
     return tuple(int(x) for x in picture[v, u])
+
+
+def test_detections_are_explained_even_if_a_bead_is_behind_the_source():
+    image = np.zeros((600, 700), np.uint8)
+    found = Fake(
+        detections=Fake(uv=np.array([[100.0, 200], [400, 300]])),
+        match=Fake(predicted=np.array([[101.0, 200], [np.nan, np.nan]])),
+        imaging=Fake(profile=Fake(reach_px=8.0)),
+        uv=np.zeros((0, 2)),
+        overlapped=np.zeros(0, dtype=bool),
+        bead=np.zeros(0, dtype=int),
+        refused=(),
+    )
+    picture = overlay.draw_overlay(image, found)
+    assert colours_at(picture, 392, 292) == overlay.UNEXPLAINED
+    assert not picture[180:220, 80:120].any()
 
 
 def test_markers_are_drawn_in_their_colours_where_they_are():
@@ -410,6 +427,29 @@ def test_spread_of_a_point_is_that_of_its_projection(rig):
         uv = known.project(view, np.vstack([xyz, [[np.nan] * 3]]))
         np.testing.assert_allclose(uv[0], fluoroscope.ideal(xyz)[0], atol=1e-6)
         assert np.isnan(uv[1]).all()
+
+
+def test_points_behind_the_source_are_not_projected(rig):
+    _, known = rig
+    source = known.orientation.position_mm[0]
+    behind = np.array([[0.0, 0, 0], 1.5 * source])
+    assert np.isfinite(known.project(0, behind)).all(axis=1).tolist() == [True, False]
+
+
+def test_projections_are_corrected_to_where_they_come_from(rig):
+    """The error of the inverse of a distortion is far below the noise, also at the border."""
+    _, known = rig
+    smooth = pincushion('a', (1024, 1024))
+    steep = replace(smooth.model, train_duv=5 * smooth.model.train_duv)
+    calibrations = {name: replace(smooth, fluoroscope=name, model=steep) for name in 'abc'}
+    distorted = CalibratedRig(known.orientation, calibrations, {})
+    points = np.random.default_rng(2).uniform(-110, 110, (400, 3))
+    for view, name in enumerate('abc'):
+        seen = distorted.project(view, points)
+        inside = ((seen > 0) & (seen < 1023)).all(axis=1)
+        ideal = known.project(view, points)
+        corrected = distorted.calibrations[name].correct(seen[inside]).uv
+        assert inside.sum() > 100 and np.abs(corrected - ideal[inside]).max() < 2e-3
 
 
 def test_shadows_of_three_views_meet_in_points(rig):

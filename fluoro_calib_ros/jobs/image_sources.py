@@ -16,9 +16,11 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.angles import AngleOptions, JointAngles
+from ..exposures.pairing import PairingOptions
+from ..exposures.stamps import ExposureNumbers
 from ..io.bags.mcap_file import METADATA, is_bag
 from ..io.bags.metadata import TARGET_OBSERVATIONS
-from ..io.bags.reader import angles_in, image_topics, images_of_topic, topics_of
+from ..io.bags.reader import angles_in, image_topics, images_of, topics_of
 from ..io.image_reading import (
     DICOM_SUFFIXES,
     EXPOSURE_SUFFIXES,
@@ -98,15 +100,18 @@ def open_sources(
 ) -> ImageSources:
     """Open images of one fluoroscope.
 
+    Images of bags have the number of their exposure by the stamps of all fluoroscopes, as live.
     If all file names contain a number and these differ, they are the exposure numbers; otherwise
-    exposures are numbered in the order of the sources. fluoroscope selects the topic of a bag with
-    several. Raises DataError for a source that cannot contain images.
+    exposures are numbered in the order of the sources. fluoroscope selects the images of a bag
+    with several. Raises DataError for a source that cannot contain images.
     """
     files: list[Path] = []
-    topics: dict[Path, str] = {}
+    bags: dict[Path, str] = {}  # name of the fluoroscope in each bag
+    names: set[str] = set()  # of all fluoroscopes in bags
     for source in sources:
         if is_image_bag(source):
-            topics[source] = _topic(source, fluoroscope)
+            names.update(image_topics(source))
+            bags[source] = _name_in(source, fluoroscope)
             files.append(source)
         elif source.is_dir():
             files += _images_in(source)
@@ -115,17 +120,23 @@ def open_sources(
     if not files:
         raise DataError('there are no images')
     angles = angles or ImageAngles()
-    readers = [_reader(path, topics.get(path), fluoroscope, angles) for path in files]
+    readers = [_reader(path, bags.get(path), fluoroscope, angles) for path in files]
     single = all(count == 1 for count, _ in readers)
     numbers = [_number(path) for path in files]
     numbered = single and None not in numbers and len(set(numbers)) == len(numbers)
 
     def images() -> Iterator[SourceImage]:
         exposure = 0
+        of_files = 0  # number of images so far that are not of a bag
+        by_stamp = ExposureNumbers(names, PairingOptions().tolerance_ns)
         for path, (_, read), number in zip(files, readers, numbers):
             video = image_suffix_of(path) in VIDEO_SUFFIXES
-            for frame, (place, image, angle) in enumerate(read()):
-                exposure = number if numbered and number is not None else exposure + 1
+            for frame, (in_bag, place, image, angle) in enumerate(read(by_stamp)):
+                if in_bag is not None:
+                    exposure = of_files + in_bag
+                else:
+                    of_files += 1
+                    exposure = number if numbered and number is not None else exposure + 1
                 yield SourceImage(exposure, place, image, frame if video else None, angle)
 
     return ImageSources(sum(count for count, _ in readers), images)
@@ -193,9 +204,9 @@ def contains_images(source: Path) -> bool:
         return not source.is_dir() and bool(image_suffix_of(source))
     try:
         types = [info.type for info in topics_of(source).values()]
-        return TARGET_OBSERVATIONS not in types and bool(image_topics(source))
     except DataError:
         return False  # the reader of bags reports the reason
+    return TARGET_OBSERVATIONS not in types and bool(image_topics(source))
 
 
 def _images_in(folder: Path) -> list[Path]:
@@ -214,48 +225,51 @@ def _number(path: Path) -> int | None:
     return int(numbers[-1][-9:]) if numbers else None
 
 
-def _topic(source: Path, fluoroscope: str) -> str:
-    """Return the topic of a fluoroscope in a bag. Raises DataError."""
-    topics = image_topics(source)
-    if fluoroscope in topics:
-        return topics[fluoroscope]
-    if len(topics) == 1:
-        return next(iter(topics.values()))
+def _name_in(source: Path, fluoroscope: str) -> str:
+    """Return the name of a fluoroscope in a bag, that of its only one if it is another.
+
+    Raises DataError.
+    """
+    names = sorted(image_topics(source))
+    if fluoroscope in names:
+        return fluoroscope
+    if len(names) == 1:
+        return names[0]
     raise DataError(
-        f'{source}: there are no images of fluoroscope {fluoroscope!r}, only of '
-        f'{", ".join(sorted(topics))}'
+        f'{source}: there are no images of fluoroscope {fluoroscope!r}, only of {", ".join(names)}'
     )
 
 
-_Placed = tuple[str, np.ndarray | DataError, float | None]  # place, image, angle
+# number of the exposure in a bag, place, image, angle
+_Placed = tuple[int | None, str, np.ndarray | DataError, float | None]
+_Read = Callable[[ExposureNumbers], Iterator[_Placed]]
 
 
 def _reader(
-    path: Path, topic: str | None, fluoroscope: str, angles: ImageAngles
-) -> tuple[int, Callable[[], Iterator[_Placed]]]:
+    path: Path, name: str | None, fluoroscope: str, angles: ImageAngles
+) -> tuple[int, _Read]:
     """Return the number of images of a file, and a function that reads them."""
-    if topic is not None:
-        return topics_of(path)[topic].count, _bag_reader(path, topic, fluoroscope, angles)
+    if name is not None:
+        count = topics_of(path)[image_topics(path)[name]].count
+        return count, _bag_reader(path, name, fluoroscope, angles)
     try:
         count = open_images(path).count
     except DataError as error:
         if not os.path.exists(path):
             raise
         damaged = error
-        return 1, lambda: iter([(str(path), damaged, None)])
-    return count, lambda: _read(path, angles.angle)
+        return 1, lambda _: iter([(None, str(path), damaged, None)])
+    return count, lambda _: _read(path, angles.angle)
 
 
-def _bag_reader(
-    path: Path, topic: str, fluoroscope: str, angles: ImageAngles
-) -> Callable[[], Iterator[_Placed]]:
+def _bag_reader(path: Path, name: str, fluoroscope: str, angles: ImageAngles) -> _Read:
     """Return a function that reads the images of a bag. Raises DataError for a missing joint."""
     track = angles.track(path, fluoroscope)
 
-    def read() -> Iterator[_Placed]:
-        for place, image, stamp_ns in images_of_topic(path, topic):
+    def read(numbers: ExposureNumbers) -> Iterator[_Placed]:
+        for exposure, place, image, stamp_ns in images_of(path, name, numbers):
             angle = None if stamp_ns is None else track.at(fluoroscope, stamp_ns)
-            yield place, image, angle if track.joints else angles.angle
+            yield exposure, place, image, angle if track.joints else angles.angle
 
     return read
 
@@ -264,6 +278,6 @@ def _read(path: Path, angle: float | None) -> Iterator[_Placed]:
     """Yield the images of a file; if one cannot be read, yield the error and stop."""
     try:
         for place, image in open_images(path).images:
-            yield place, image.copy(), angle
+            yield None, place, image.copy(), angle
     except DataError as error:
-        yield str(path), error, None
+        yield None, str(path), error, None

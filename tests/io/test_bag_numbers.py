@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.stamps import ExposureNumbers
 from fluoro_calib_ros.io.bags import recording, salvage
 from fluoro_calib_ros.io.bags.mcap_file import MAGIC, RECORD
 from fluoro_calib_ros.io.bags.metadata import (
@@ -31,7 +32,7 @@ from fluoro_calib_ros.io.bags.reader import (
     _pixels,
     _renumbered,
     image_topics,
-    images_of_topic,
+    images_of,
 )
 from fluoro_calib_ros.io.bags.recording import Recording, lost_text
 from fluoro_calib_ros.io.bags.salvage import (
@@ -362,13 +363,60 @@ def test_images_of_a_bag_are_those_of_a_topic_of_each_fluoroscope(tmp_path):
         'b': '/lab/b/image_raw',
         'c': '/lab/c/image_raw/compressed',
     }
-    first, second, third = images_of_topic(bag, '/a')
+    numbers = ExposureNumbers('abc', 2 * MS)
+    first, second, third = images_of(bag, 'a', numbers)
     assert first.stamp_ns == second.stamp_ns == 3 * 10**9 + 7
     assert first.image.tolist() == third.image.tolist() == grey.tolist()
     assert isinstance(second.image, DataError)
     assert second.place == f'{bag}, topic /a, message 2' and second.place in str(second.image)
-    (refused,) = images_of_topic(bag, '/lab/c/image_raw/compressed')
+    (refused,) = images_of(bag, 'c', numbers)
     assert isinstance(refused.image, DataError) and refused.stamp_ns == 3 * 10**9 + 7
+
+
+@pytest.fixture
+def camera_bag(tmp_path):
+    """A function that writes a bag with an image on each of some topics."""
+
+    def write(*topics):
+        grey = np.arange(6, dtype=np.uint8).reshape(2, 3)
+        header = message_class('std_msgs/msg/Header')(stamp_of(3), '')
+        plain = message_class(IMAGE)(header, 2, 3, 'mono8', 0, 3, grey.ravel())
+        packed = message_class(COMPRESSED_IMAGE)(header, 'png', np.zeros(9, np.uint8))
+        with BagWriter(tmp_path / 'bag') as out:
+            for topic in topics:
+                is_packed = topic.endswith(('/compressed', '/radiograph'))
+                message = (COMPRESSED_IMAGE, packed) if is_packed else (IMAGE, plain)
+                out.write(topic, *message, 10**9)
+        return tmp_path / 'bag'
+
+    return write
+
+
+def stamp_of(seconds):
+    return message_class('builtin_interfaces/msg/Time')(seconds, 0)
+
+
+RAW = '/rig/a/image_raw/compressed'
+
+
+@pytest.mark.parametrize(
+    'others', [('radiograph',), ('image_corrected',), ('coverage', 'image_overlay'), ('zoom',)]
+)
+def test_images_of_a_bag_are_those_of_the_camera(camera_bag, others):
+    """Not those that the nodes publish of them, which a recording of all topics contains."""
+    bag = camera_bag(RAW, *(f'/rig/a/{name}' for name in others))
+    assert image_topics(bag) == {'a': RAW}
+
+
+def test_images_that_the_nodes_publish_are_none_of_a_camera(camera_bag):
+    assert image_topics(camera_bag('/a/radiograph', '/b/coverage')) == {}
+
+
+@pytest.mark.parametrize('topics', [('/a/x', '/a/y'), ('/one/a/image_raw', '/two/a/image_raw')])
+def test_several_cameras_of_a_fluoroscope_are_refused(camera_bag, topics):
+    with pytest.raises(DataError) as caught:
+        image_topics(camera_bag(*topics))
+    assert all(topic in str(caught.value) for topic in topics)
 
 
 # ---- recording

@@ -15,7 +15,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.io.bags.mcap_file import is_bag
 from fluoro_calib_ros.io.bags.metadata import TARGET_OBSERVATIONS, message_class, to_cdr
-from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, iterate_messages
+from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, IMAGE, iterate_messages
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.jobs.conversion import ConversionRequest, convert, is_result_folder
@@ -163,3 +163,39 @@ def test_bags_and_result_folders_are_told_by_what_they_hold(folder, source):
     assert is_result_folder(path) == (source == 'result')
     if not source.startswith(('missing', 'cut')):
         assert is_image_bag(path) == source.startswith(('radiographs', 'both'))
+
+
+def test_images_of_a_bag_are_numbered_by_stamp(tmp_path):
+    """A lost image of one fluoroscope shifts no exposure, also in further bags; as live."""
+    header = message_class('std_msgs/msg/Header')
+    time = message_class('builtin_interfaces/msg/Time')
+
+    def write(bag, name, moment, stamp):
+        pixels = np.full(4, moment, np.uint8)
+        image = message_class(IMAGE)(header(time(stamp, 0), ''), 2, 2, 'mono8', 0, 2, pixels)
+        bag.write(f'/{name}/image_raw', IMAGE, image, 10**9 * moment + (name == 'b'))
+
+    for number in (0, 1):
+        with BagWriter(tmp_path / f'bag{number}') as bag:
+            for moment in range(1, 5):
+                for name in 'ab':
+                    if (name, moment) not in {('b', 2), ('b', 4)}:
+                        write(bag, name, moment + 4 * number, 100 * number + moment)
+    bags = [tmp_path / 'bag0', tmp_path / 'bag1']
+    for name in 'ab':
+        images = list(open_sources(bags, name).images())
+        assert [image.exposure for image in images] == [int(image.image[0, 0]) for image in images]
+        assert len(images) == (8 if name == 'a' else 4)
+
+
+def test_images_of_a_bag_without_stamps_are_numbered_by_order(tmp_path):
+    header = message_class('std_msgs/msg/Header')
+    stamp = message_class('builtin_interfaces/msg/Time')(0, 0)
+    image = message_class(IMAGE)(header(stamp, ''), 1, 1, 'mono8', 0, 1, np.zeros(1, np.uint8))
+    with BagWriter(tmp_path / 'bag') as bag:
+        for moment in range(1, 4):
+            bag.write('/a/image_raw', IMAGE, image, moment)
+            bag.write('/b/image_raw', IMAGE, image, moment)
+    for name in 'ab':
+        images = open_sources([tmp_path / 'bag'], name).images()
+        assert [image.exposure for image in images] == [1, 2, 3]

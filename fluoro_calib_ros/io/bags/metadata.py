@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from rosbags.typesys.store import Typestore
 from ...correction.calibration_record import FIELDS, VERSION
 from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame, stack_image_points
-from ...exposures.stamps import nanoseconds_from_stamp
+from ...exposures.stamps import NS_PER_S, nanoseconds_from_stamp
 from ..documents import parse_yaml
 
 PACKAGE = 'fluoro_calib_msgs'
@@ -265,6 +266,14 @@ def frame_from_message(message: Any, fluoroscope: str) -> Frame:
         stamp_ns=nanoseconds_from_stamp(message.header.stamp),
         frame_id=message.header.frame_id,
     )
+
+
+def header_stamp_ns(data: bytes) -> int | None:
+    """Return the stamp [ns] of a message that begins with a header, None if it is too short."""
+    if len(data) < 12:
+        return None
+    sec, nanosec = struct.unpack_from('<iI' if data[1] == 1 else '>iI', data, 4)
+    return int(sec * NS_PER_S + nanosec)
 
 
 def message_from_frame(frame: Frame) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 from ...errors import DataError, ErrorsAt
 from ...exposures.angles import AngleOptions, JointAngles
 from ...exposures.frame import Frame, Frames, validate_frame, without_strays
-from ...exposures.stamps import nanoseconds_from_stamp
+from ...exposures.stamps import ExposureNumbers, nanoseconds_from_stamp
 from ...limits import MAX_OBSERVATIONS
 from ..access import PathLike, check_safe_name
 from .mcap_file import (
@@ -36,6 +36,7 @@ from .metadata import (
     fluoroscope_of_topic,
     frame_from_message,
     from_cdr,
+    header_stamp_ns,
     type_hash,
     typestore,
 )
@@ -276,49 +277,85 @@ COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 PIXEL_TYPES = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '16UC1': 'u2'}
 
 
-class BagImage(NamedTuple):
-    """An image (h, w) of a bag, its place in words, and its stamp [ns], None if unreadable.
+# Images that this package publishes of those of a fluoroscope.
+OWN_IMAGES = ('coverage', 'image_corrected', 'image_overlay', 'radiograph')
 
-    If the image cannot be read, image is the DataError with the cause.
+
+class BagImage(NamedTuple):
+    """An image (h, w) of a bag, its exposure, its place in words, and its stamp [ns].
+
+    If the image cannot be read, image is the DataError with the cause; the stamp is None if it
+    cannot be read either.
     """
 
+    exposure: int
     place: str
     image: np.ndarray | DataError
     stamp_ns: int | None
 
 
 def image_topics(source: PathLike) -> dict[str, str]:
-    """Return the image topics of a bag by fluoroscope, the last but one part of the topic's name.
+    """Return the topics with images of a camera by fluoroscope, the last but one part of the name.
 
     The suffix /compressed of image_transport is ignored. If a fluoroscope has both, the
-    uncompressed images are used. Raises DataError.
+    uncompressed images are used; of several topics it is image_raw. Raises DataError if several
+    remain.
     """
-    topics: dict[str, str] = {}
+    topics: dict[str, dict[str, str]] = {}  # by fluoroscope and name without suffix
     for kind in (COMPRESSED_IMAGE, IMAGE):
         for topic, info in topics_of(source).items():
-            if info.type == kind and info.count:
-                base = topic.removesuffix('/compressed')
-                parts = [part for part in base.split('/') if part]
-                topics[parts[0] if len(parts) == 1 else fluoroscope_of_topic(base)] = topic
-    return topics
+            base = topic.removesuffix('/compressed')
+            parts = [part for part in base.split('/') if part]
+            is_own = len(parts) > 1 and parts[-1] in OWN_IMAGES
+            if info.type == kind and info.count and not is_own:
+                name = parts[0] if len(parts) == 1 else fluoroscope_of_topic(base)
+                topics.setdefault(name, {})[base] = topic
+    return {name: _camera_topic(source, name, bases) for name, bases in sorted(topics.items())}
 
 
-def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
-    """Yield the images of a topic. Raises DataError for a damaged bag."""
+def _camera_topic(source: PathLike, name: str, topics: Mapping[str, str]) -> str:
+    """Return the topic of a camera among the image topics of a fluoroscope. Raises DataError."""
+    raw = [topic for base, topic in topics.items() if base.endswith('/image_raw')]
+    candidates = raw or list(topics.values())
+    if len(candidates) > 1:
+        raise DataError(
+            f'{source}: images of fluoroscope {name} are on the topics '
+            f'{", ".join(sorted(candidates))}; record the one with its radiographs alone, or name '
+            f'it {name}/image_raw'
+        )
+    return candidates[0]
+
+
+def images_of(source: PathLike, fluoroscope: str, numbers: ExposureNumbers) -> Iterator[BagImage]:
+    """Yield the images of a fluoroscope. Raises DataError for a damaged bag.
+
+    The images of all fluoroscopes get numbers in the order of time, as live, so that a lost image
+    does not shift exposures.
+    """
+    topics = {topic: name for name, topic in image_topics(source).items()}
+    kinds = topics_of(source)
+    count = 0
+    for message in iterate_messages(source, topics):
+        name = topics[message.topic]
+        stamp_ns = header_stamp_ns(message.data)
+        number = numbers.number(name, message.log_time_ns if stamp_ns is None else stamp_ns)
+        if name == fluoroscope:
+            count += 1
+            where = f'{source}, topic {message.topic}, message {count}'
+            image = _decoded(message.data, kinds[message.topic].type)
+            image = image.at(where) if isinstance(image, DataError) else image
+            yield BagImage(number, where, image, stamp_ns)
+
+
+def _decoded(data: bytes, kind: str) -> np.ndarray | DataError:
+    """Return the image of a message, or the error with which it cannot be read."""
     from ...images.codec import decode  # loads OpenCV, which a player does not need
 
-    kind = topics_of(source)[topic].type
-    for number, message in enumerate(iterate_messages(source, [topic]), 1):
-        stamp_ns = None
-        where = f'{source}, topic {topic}, message {number}'
-        try:
-            content = from_cdr(message.data, kind)
-            stamp_ns = nanoseconds_from_stamp(content.header.stamp)
-            image = decode(content.data) if kind == COMPRESSED_IMAGE else _pixels(content)
-        except DataError as error:
-            yield BagImage(where, error.at(where), stamp_ns)
-        else:
-            yield BagImage(where, image, stamp_ns)
+    try:
+        content = from_cdr(data, kind)
+        return decode(content.data) if kind == COMPRESSED_IMAGE else _pixels(content)
+    except DataError as error:
+        return error
 
 
 def _pixels(message: Any) -> np.ndarray:

@@ -745,6 +745,12 @@ def test_damaged_c3d_is_refused(tmp_path):
     assert refused(path) == f'{path}: 3 points, but 0 different names'
 
 
+def test_sleap_of_frames_that_are_a_date_is_refused(tmp_path):
+    given = Content(observations=frames(numbers=(0, 20240131)), names=Names())
+    with pytest.raises(DataError, match='frame 20240131 would need as many rows'):
+        registry.write(tmp_path / 'points', 'sleap', given, SETTINGS)
+
+
 @pytest.mark.parametrize('kind', ['c3d', 'trc', 'xmalab3d', 'points'])
 def test_points_in_space_return(tmp_path, kind):
     path = tmp_path / f'out.{kind if kind in ("c3d", "trc") else "csv"}'
@@ -845,6 +851,32 @@ def test_xmalab_3d_points_of_a_lab_are_read(tmp_path):
     assert found.frame.tolist() == [1, 2]
     assert found.xyz_mm[1, 1].tolist() == [70, 80, 90] and np.isnan(found.xyz_mm[0, 1]).all()
     assert 'does not state the unit' in refused(path, FileSettings())
+
+
+@pytest.mark.parametrize('kind', ['trc', 'xmalab3d', 'rigidbody'])
+@pytest.mark.parametrize('order', [(1, 0, 2), (0, 1, 1)])
+def test_frames_out_of_order_are_refused(tmp_path, kind, order):
+    path = tmp_path / ('a.trc' if kind == 'trc' else 'a.csv')
+    bodies = Bodies(
+        ('b',), np.array([4, 5, 6]), np.tile(np.eye(3), (3, 1, 1, 1)), np.zeros((3, 1, 3))
+    )
+    content = Content(points=points(9.0), bodies=bodies)
+    registry.write(path, kind, content, SETTINGS)
+    *head, first, second, third = path.read_text().splitlines()
+    rows = [[first, second, third][index] for index in order]
+    path.write_text('\n'.join([*head, *rows]) + '\n')
+    assert 'comes after frame' in refused(path, SETTINGS, kind)
+
+
+def test_trc_that_is_cut_off_has_a_note(tmp_path):
+    path = tmp_path / 'a.trc'
+    registry.write(path, 'trc', Content(points=points(9.0)), SETTINGS)
+    assert not registry.read(path, SETTINGS).notes
+    lines = path.read_text().splitlines()
+    path.write_text('\n'.join(lines[:-1]) + '\n')
+    (note,) = registry.read(path, SETTINGS).notes
+    rows = len(lines) - 6
+    assert note == f'{path}: the header states {rows} frames, the file has {rows - 1}'
 
 
 # ---- rigid bodies

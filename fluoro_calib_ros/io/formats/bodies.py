@@ -52,8 +52,8 @@ from .content import (
 )
 from .tables import (
     Row,
+    ascending_frames,
     bodies_of,
-    frame_numbers,
     frames_of,
     joined,
     rate_of,
@@ -75,7 +75,7 @@ def _read_xmalab(path: Path, settings: FileSettings) -> Content:
     names = _bodies(header, first_column)
     require_width(rows, len(header.cells), 'the header')
     mm = settings.unit_read(path)
-    frame = frame_numbers(rows, first_column)
+    frame = ascending_frames(rows, first_column)
     values = np.array([row.numbers_or_nan(first_column) for row in rows])
     matrices = values.reshape(len(rows), len(names), 4, 4).transpose(0, 1, 3, 2)
     for row, row_matrices in zip(rows, matrices):
@@ -85,7 +85,7 @@ def _read_xmalab(path: Path, settings: FileSettings) -> Content:
     translation = from_units(matrices[..., :3, 3], mm)
     rotation[missing] = np.nan
     translation[missing] = np.nan
-    return Content(bodies=Bodies(tuple(names), np.array(frame), rotation, translation))
+    return Content(bodies=Bodies(tuple(names), frame, rotation, translation))
 
 
 def _bodies(row: Row, first: int) -> list[str]:

@@ -30,6 +30,7 @@ from .content import Content, FileSettings, Format, Sample, Written
 from .reader_process import HDF5, hdf5_arrays, require_h5py
 from .tables import (
     Row,
+    check_row_count,
     default_name,
     frame_of,
     number_text,
@@ -259,6 +260,7 @@ def write_sleap(path: Path, content: Content, settings: FileSettings) -> Written
     require_h5py(path)
     files = _files_of_cameras(path, content, '.analysis.h5')
     for file, frames in files.items():
+        check_row_count(file, max(frame.number for frame in frames))
         write_bytes(file, _content_of(frames, content.names.target_names()))
     return Written(tuple(files))
 

@@ -22,6 +22,7 @@ import math
 import os
 import re
 import struct
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -51,8 +52,8 @@ from .content import (
 from .reader_process import arrays_apart
 from .tables import (
     Row,
+    ascending_frames,
     bodies_of,
-    frame_numbers,
     frames_of,
     joined,
     labels,
@@ -265,14 +266,11 @@ def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
     require_width(rows, 3 * len(targets) + first_column, 'the header')
     mm = settings.unit_read(path)
     target_id, content_names = numbered_targets(targets, settings.names.targets)
-    frame = frame_numbers(rows, first_column)
-    for previous, row, number in zip(frame, rows[1:], frame[1:]):
-        if number <= previous:
-            row.fail(f'frame {number} comes after frame {previous}')
+    frame = ascending_frames(rows, first_column)
     values = np.array([row.numbers_or_nan(first_column) for row in rows])
     xyz = from_units(values.reshape(len(rows), -1, 3), mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
-    points = points_without_precision(np.array(frame), target_id, xyz, settings.rate_hz)
+    points = points_without_precision(frame, target_id, xyz, settings.rate_hz)
     return Content(points=points, names=content_names)
 
 
@@ -349,21 +347,28 @@ def _read_trc(path: Path, settings: FileSettings) -> Content:
         raise DataError(
             f'{path}, row 4: {len(set(names))} names of {count} markers at {rate:g} Hz'
         )
-    frame = []
-    xyz = []
-    for number, line in enumerate(lines[_HEADER_ROWS:], _HEADER_ROWS + 1):
-        if line.strip():
-            row = Row(path, number, [cell.strip() for cell in line.split('\t')])
-            frame.append(row.whole(0, 'Frame#'))
-            xyz.append(_coordinates(row, count))
-    if not frame:
+    rows = [
+        Row(path, number, [cell.strip() for cell in line.split('\t')])
+        for number, line in enumerate(lines[_HEADER_ROWS:], _HEADER_ROWS + 1)
+        if line.strip()
+    ]
+    if not rows:
         raise DataError(f'{path}: the file has no frames')
     target_id, content_names = numbered_targets(names, settings.names.targets)
-    xyz_mm = from_units(np.array(xyz), mm)
+    xyz_mm = from_units(np.array([_coordinates(row, count) for row in rows]), mm)
     return Content(
-        points=points_without_precision(np.array(frame), target_id, xyz_mm, rate),
+        points=points_without_precision(ascending_frames(rows, 1), target_id, xyz_mm, rate),
         names=content_names,
+        notes=_missing_frames(path, header, len(rows)),
     )
+
+
+def _missing_frames(path: Path, header: Mapping[str, str], count: int) -> tuple[str, ...]:
+    """Return a note if a header states another number of frames than the file has."""
+    stated = header.get('NumFrames', str(count))
+    if Row(path, 3, [stated]).whole(0, 'NumFrames') == count:
+        return ()
+    return (f'{path}: the header states {stated} frames, the file has {count}',)
 
 
 def _coordinates(row: Row, count: int) -> NDArray[np.float64]:

@@ -176,6 +176,21 @@ def frame_numbers(rows: Sequence[Row], first: int) -> list[int]:
     return [row.whole(0, 'Frame') if first else number for number, row in enumerate(rows, 1)]
 
 
+def ascending_frames(rows: Sequence[Row], first: int) -> NDArray[np.int64]:
+    """Return the frame numbers as `frame_numbers`. Raises DataError unless they ascend."""
+    numbers = frame_numbers(rows, first)
+    for previous, row, number in zip(numbers, rows[1:], numbers[1:]):
+        if number <= previous:
+            row.fail(f'frame {number} comes after frame {previous}')
+    return np.array(numbers)
+
+
+def check_row_count(path: PathLike, last: int, shift: int = 0) -> None:
+    """Raise DataError if rows for all frames from 0 or 1 to the last one are too many to write."""
+    if last + shift > MAX_ROWS:
+        raise DataError(f'{path}: frame {last} would need as many rows, at most {MAX_ROWS}')
+
+
 def require_width(rows: Iterable[Row], width: int, label: str) -> None:
     """Raise DataError for the first row that does not have `width` cells."""
     for row in rows:

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
-from ...limits import MAX_ROWS
 from ..access import atomic_file
 from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Written
 from .tables import (
     Row,
+    check_row_count,
     default_name,
     frame_numbers,
     frame_of,
@@ -172,8 +172,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     )
     labels = [target_names.get(i, default_name(i)) for i in ids]
     shift = int(numbers[0] == 0)
-    if numbers[-1] + shift > MAX_ROWS:
-        raise DataError(f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_ROWS}')
+    check_row_count(path, numbers[-1], shift)
     with atomic_file(path, 'w') as file:
         file.write(
             ','.join(

@@ -7,10 +7,24 @@ import io
 import os
 import tracemalloc
 import zipfile
+from dataclasses import replace
 
+import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from rigs import calibrated, rig, run
 
@@ -19,6 +33,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io import access
 from fluoro_calib_ros.io.bags import reader as reader_module
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
+from fluoro_calib_ros.io.bags.salvage import inspect_bag
 from fluoro_calib_ros.io.calibration import load_calibration, save_calibration
 from fluoro_calib_ros.io.documents import parse_yaml
 from fluoro_calib_ros.io.formats.native import read_known_orientations
@@ -90,6 +105,59 @@ def test_chunk_that_would_be_giant_is_not_decompressed(tmp_path, monkeypatch):
         (tmp_path / 'bomb.mcap').write_bytes(content)
         message = refused(lambda: list(iterate_messages(tmp_path / 'bomb.mcap')))
         assert 'a chunk of the bag takes 629 MB' in message
+
+
+def bag_of_a_chunk(path, chunk, indexed):
+    """Write a bag whose chunk is behind the end of its data, where only the index names it."""
+    buffer = io.BytesIO()
+    writer = Writer(buffer, compression=CompressionType.NONE)
+    writer.start('ros2', 'x')
+    schema = writer.register_schema('std_msgs/msg/String', 'ros2msg', b'string data')
+    channel = writer.register_channel('/x', 'cdr', schema)
+    writer.add_message(channel, 1, b'\0\1\0\0', 1)
+    writer.finish()
+    records = list(StreamReader(io.BytesIO(buffer.getvalue()), emit_chunks=True).records)
+    builder = RecordBuilder()
+    parts = {type(record): record for record in records}
+    magic = b'\x89MCAP0\r\n'
+    out = magic + _bytes(builder, parts[Header])
+    out += _bytes(builder, parts[DataEnd]) if indexed else b''
+    at = len(out)
+    out += _bytes(builder, chunk)
+    out += b'' if indexed else _bytes(builder, DataEnd(0))
+    start = len(out)
+    if indexed:
+        index = replace(
+            parts[ChunkIndex], chunk_start_offset=at, chunk_length=start - at, message_start_time=1
+        )
+        for record in (parts[Schema], parts[Channel], parts[Statistics], index):
+            out += _bytes(builder, record)
+    footer = Footer(start if indexed else 0, 0, 0)
+    path.write_bytes(out + _bytes(builder, footer) + magic)
+    return path
+
+
+def _bytes(builder, record):
+    record.write(builder)
+    return builder.end()
+
+
+@pytest.mark.parametrize('indexed', [True, False])
+@pytest.mark.parametrize(
+    ('compression', 'stated', 'sentence'),
+    [('zstd', 600 * 2**20, 'a chunk of the bag takes 629 MB'), ('lz4', 1000, 'does not have the')],
+)
+def test_chunk_that_hides_its_size_is_not_decompressed(
+    tmp_path, compression, stated, sentence, indexed
+):
+    """Neither by the index of a bag nor in a recovery."""
+    compress = {'zstd': zstandard.compress, 'lz4': lz4.frame.compress}[compression]
+    data = compress(bytes(600 * 2**20))
+    chunk = Chunk(compression, data, 1, 1, uncompressed_crc=0, uncompressed_size=stated)
+    path = bag_of_a_chunk(tmp_path / 'bomb.mcap', chunk, indexed)
+    assert sentence in refused(lambda: list(iterate_messages(path)))
+    if not indexed:
+        assert 'nothing can be read' in refused(inspect_bag, path)
 
 
 def test_giant_message_is_not_decoded(tmp_path, monkeypatch):

@@ -5,25 +5,27 @@
 
 from __future__ import annotations
 
+import heapq
 import os
 import re
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
+import lz4.frame
 import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, McapRecord, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...limits import MAX_CHUNK, MAX_TOPICS
 from ..access import PathLike, check_regular_file, os_errors
 from ..documents import read_yaml
@@ -36,6 +38,7 @@ MAGIC = b'\x89MCAP0\r\n'
 SQLITE = b'SQLite format 3\0'  # signature of a bag with the storage sqlite3
 FOOTER = struct.Struct('<BQQQI')  # opcode, length, two offsets, checksum
 RECORD = struct.Struct('<BQ')  # opcode and length
+MAX_RECORD = MAX_CHUNK + 1000  # bytes of a chunk and its head
 
 
 class BagMessage(NamedTuple):
@@ -94,7 +97,6 @@ def channels_of_file(path: str) -> list[ChannelInfo]:
             channels = summary.channels
             counts = summary.statistics.channel_message_counts
         else:
-            _check_chunks(file)
             scan = _scan(file)
             schemas = scan.schemas
             channels = scan.channels
@@ -115,16 +117,11 @@ def messages_of_file(path: str, topics: Collection[str] | None) -> Iterator[BagM
     topics: names of the topics to read, None for all. Raises DataError for a damaged file.
     """
     with _open_checked(path) as file:
-        _check_chunks(file)
         summary = _complete_summary(file)
         if summary is None or not summary.chunk_indexes:
             yield from _unindexed_messages(file, topics)
-            return
-        reader = SeekingReader(file, validate_crcs=True)
-        for schema, channel, message in reader.iter_messages(topics=topics):
-            yield BagMessage(
-                channel.topic, schema.name if schema else '', message.log_time, message.data
-            )
+        else:
+            yield from _indexed_messages(file, summary, topics)
 
 
 @contextmanager
@@ -165,32 +162,6 @@ def _check_ends(path: str, file: BinaryIO) -> None:
     file.seek(0)
 
 
-def _check_chunks(file: BinaryIO) -> None:
-    """Raise DataError for a chunk that would need too much memory, without decompressing it."""
-    position = len(MAGIC)
-    size = file.seek(0, os.SEEK_END)
-    while position + RECORD.size <= size:
-        file.seek(position)
-        head = file.read(100)  # of a chunk: includes its sizes and compression
-        opcode, length = RECORD.unpack_from(head)
-        if opcode == Opcode.CHUNK:
-            (chunk_size,) = struct.unpack_from('<Q', head, RECORD.size + 16)
-            (name_length,) = struct.unpack_from('<I', head, RECORD.size + 28)
-            start = RECORD.size + 32 + name_length + 8
-            if head[RECORD.size + 32 : start - 8] == b'zstd':
-                with suppress(zstandard.ZstdError):
-                    chunk_size = max(chunk_size, zstandard.frame_content_size(head[start:]))
-            if chunk_size > MAX_CHUNK:
-                raise DataError(
-                    f'{file.name}: a chunk of the bag takes {chunk_size / 1e6:.0f} MB; the limit '
-                    f'is {MAX_CHUNK / 1e6:.0f} MB'
-                )
-        elif opcode == Opcode.DATA_END:
-            break
-        position += RECORD.size + length
-    file.seek(0)
-
-
 def _complete_summary(file: BinaryIO) -> Summary | None:
     """Return the summary of a file, None if it does not list all channels and their schemas."""
     summary = SeekingReader(file).get_summary()
@@ -200,6 +171,40 @@ def _complete_summary(file: BinaryIO) -> Summary | None:
         return None
     used_ids = {channel.schema_id for channel in summary.channels.values()} - {0}
     return summary if used_ids <= set(summary.schemas) else None
+
+
+def _indexed_messages(
+    file: BinaryIO, summary: Summary, topics: Collection[str] | None
+) -> Iterator[BagMessage]:
+    """Yield the messages of a file by its chunk index in the order of log time."""
+    types = {number: schema.name for number, schema in summary.schemas.items()}
+    wanted = {
+        number
+        for number, channel in summary.channels.items()
+        if topics is None or channel.topic in topics
+    }
+    # Time, offset of the chunk, number in it (-1: the chunk itself), message
+    queue: list[tuple[int, int, int, Message | None]] = [
+        (index.message_start_time, index.chunk_start_offset, -1, None)
+        for index in summary.chunk_indexes
+        if not index.message_index_offsets or wanted & set(index.message_index_offsets)
+    ]
+    heapq.heapify(queue)
+    while queue:
+        _, offset, _, message = heapq.heappop(queue)
+        if message is not None:
+            channel = summary.channels[message.channel_id]
+            msg_type = types.get(channel.schema_id, '')
+            yield BagMessage(channel.topic, msg_type, message.log_time, message.data)
+            continue
+        file.seek(offset)
+        for number, record in enumerate(_records_of_chunk(file)):
+            if isinstance(record, Message) and record.channel_id not in summary.channels:
+                raise DataError(
+                    f'{file.name}: the bag is damaged, the topic of messages is unknown'
+                )
+            if isinstance(record, Message) and record.channel_id in wanted:
+                heapq.heappush(queue, (record.log_time, offset, number, record))
 
 
 def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Iterator[BagMessage]:
@@ -236,8 +241,66 @@ def _scan(file: BinaryIO) -> _Scan:
 
 
 def _records(file: BinaryIO) -> Iterator[McapRecord]:
+    """Yield all records of a file, and those of its chunks in place of these."""
     file.seek(0)
-    return StreamReader(file, validate_crcs=True).records
+    reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_RECORD)
+    for record in reader.records:
+        if isinstance(record, Chunk):
+            yield from _broken_up(file.name, record)
+        else:
+            yield record
+
+
+def _records_of_chunk(file: BinaryIO) -> list[McapRecord]:
+    """Return the records of the chunk at the position of a file. Raises DataError."""
+    reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=MAX_RECORD)
+    record = next(reader.records)
+    if not isinstance(record, Chunk):
+        raise DataError(f'{file.name}: the bag is damaged, its index names no chunk')
+    return _broken_up(file.name, record)
+
+
+def _broken_up(path: str, chunk: Chunk) -> list[McapRecord]:
+    """Return the records of a chunk. Raises DataError, also if it would need too much memory."""
+    with ErrorsAt(path):
+        content = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
+    return breakup_chunk(replace(chunk, compression='', data=content), validate_crc=True)
+
+
+def decompressed(compression: str, data: bytes | memoryview, size: int) -> bytes:
+    """Return the content of a chunk, which states its size.
+
+    Raises DataError if it cannot be decompressed, or would need too much memory.
+    """
+    if compression not in ('', 'lz4', 'zstd'):
+        raise DataError(f'a chunk of the bag has the unknown compression {compression!r}')
+    try:
+        # A frame of zstd need not state its size
+        stated = zstandard.frame_content_size(data) if compression == 'zstd' else -1
+        size = size if stated < 0 else stated
+        if size <= MAX_CHUNK:
+            return _DECOMPRESS[compression](data, size) if size else b''
+    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
+        raise DataError(f'a chunk of the bag is damaged ({_cause(error)})') from None
+    raise DataError(
+        f'a chunk of the bag takes {size / 1e6:.0f} MB; the limit is {MAX_CHUNK / 1e6:.0f} MB'
+    )
+
+
+def _without_lz4(data: bytes | memoryview, size: int) -> bytes:
+    """Return the content of an lz4 frame. Raises DataError unless it has the stated size."""
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    content: bytes = decompressor.decompress(bytes(data), max_length=size + 1)
+    if len(content) != size or not decompressor.eof:
+        raise DataError(f'a chunk of the bag does not have the {size} bytes that it states')
+    return content
+
+
+_DECOMPRESS: dict[str, Callable[[bytes | memoryview, int], bytes]] = {
+    '': lambda data, _: bytes(data),
+    'lz4': _without_lz4,
+    'zstd': lambda data, size: zstandard.ZstdDecompressor().decompress(data, max_output_size=size),
+}
 
 
 def _cause(error: Exception) -> str:

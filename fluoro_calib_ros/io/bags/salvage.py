@@ -22,17 +22,22 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import NamedTuple
 
-import lz4.frame
 import numpy as np
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, MessageIndex, Schema, Statistics
 
 from ...errors import DataError
-from ...limits import MAX_CHUNK
 from ..access import PathLike, opened
-from .mcap_file import FOOTER, MAGIC, RECORD, ChannelInfo, bag_information, candidate_files
+from .mcap_file import (
+    FOOTER,
+    MAGIC,
+    RECORD,
+    ChannelInfo,
+    bag_information,
+    candidate_files,
+    decompressed,
+)
 from .metadata import (
     PACKAGE,
     TARGET_OBSERVATIONS,
@@ -304,16 +309,8 @@ def _chunk_at(data: mmap.mmap, position: int) -> _Chunk | None:
 def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | None:
     """Return the content of a chunk, None if it cannot be decompressed."""
     try:
-        if compression == b'zstd':
-            content_size = zstandard.frame_content_size(data)
-            limit = size if content_size < 0 else content_size  # a frame need not state its size
-            if not 0 < limit <= MAX_CHUNK:
-                return None
-            return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
-        if compression == b'lz4':
-            return lz4.frame.decompress(bytes(data)) if 0 < size <= MAX_CHUNK else None
-        return bytes(data) if compression == b'' and len(data) <= MAX_CHUNK else None
-    except (zstandard.ZstdError, RuntimeError, ValueError, MemoryError):
+        return decompressed(compression.decode(errors='replace'), data, size) or None
+    except DataError:
         return None
     finally:
         data.release()

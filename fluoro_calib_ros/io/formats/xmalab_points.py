@@ -21,7 +21,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
 from ..access import atomic_file
 from ..csv_table import as_text

@@ -35,7 +35,6 @@ from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.streams import FaultHandlers, StreamReader
 from .runtime.topics import (
     DISCOVERY_S,
-    RECORDED_LATCHED_DEPTH,
     TopicDiscovery,
     adapted_qos,
     definition_of,
@@ -112,6 +111,7 @@ class RecorderNode(ParameterNode):
             topics.append(JOINT_STATES)
         self._topics_of_graph = TopicDiscovery(self, topics)
         self._topics: dict[str, str] = {}  # types by topic
+        self._latched: dict[str, TopicToRecord] = {}
         self._overrun: Counter[str] = Counter()  # messages lost at the input by topic
         self._limited_logger = RateLimitedLogger(self.get_logger())
         self._reader = StreamReader(
@@ -134,6 +134,11 @@ class RecorderNode(ParameterNode):
         """Subscribe to topics that have appeared since the last call."""
         for topic, types, publishers in self._topics_of_graph.new():
             self._subscribe(topic, types, publishers)
+        for topic, entry in self._latched.items():
+            count = latched_count(self.get_publishers_info_by_topic(topic))
+            if count > entry.latched:
+                self._latched[topic] = entry._replace(latched=count)
+                self._recording.add_topic(self._latched[topic])
 
     def _subscribe(
         self, topic: str, types: Sequence[str], publishers: Sequence[TopicEndpointInfo]
@@ -150,16 +155,21 @@ class RecorderNode(ParameterNode):
             return
         qos = adapted_qos(publishers, DEPTH)
         is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        self._topics[topic] = types[0]
-        self._recording.add_topic(
-            TopicToRecord(
-                topic,
-                types[0],
-                [qos_document(publisher.qos_profile) for publisher in publishers],
-                definition_of(types[0], type_hash_text(publishers[0])),
-                RECORDED_LATCHED_DEPTH if is_latched else 0,
-            )
+        entry = TopicToRecord(
+            topic,
+            types[0],
+            [qos_document(publisher.qos_profile) for publisher in publishers],
+            definition_of(types[0], type_hash_text(publishers[0])),
+            latched_count(publishers) if is_latched else 0,
         )
+        try:
+            self._recording.add_topic(entry)
+        except DataError as error:
+            self.get_logger().warning(f'{topic} is not recorded: {error}')
+            return
+        self._topics[topic] = types[0]
+        if is_latched:
+            self._latched[topic] = entry
 
         def on_message(data: bytes, info: dict[str, int]) -> None:
             received = info.get('received_timestamp') or time.time_ns()
@@ -222,6 +232,14 @@ class RecorderNode(ParameterNode):
             f'{self._recording.path}, {self._recording.dropped.total()} dropped; at most '
             f'{self._recording.most_waiting_bytes / 1e6:.1f} MB waited'
         )
+
+
+def latched_count(publishers: Sequence[TopicEndpointInfo]) -> int:
+    """Return how many messages of latched publishers a node that begins to listen receives.
+
+    The middleware may not tell the depth of a publisher (0), which is 1 for latched topics.
+    """
+    return sum(max(publisher.qos_profile.depth, 1) for publisher in publishers)
 
 
 def qos_document(profile: QoSProfile) -> dict[str, Any]:

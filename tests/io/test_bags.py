@@ -5,6 +5,7 @@
 
 import io
 import os
+import resource
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -554,6 +555,25 @@ def test_truncated_bag_is_reported(tmp_path):
         for read in (read_frames, topics_of, lambda source: list(iterate_messages(source))):
             assert str(path) in message_of(read, str(path))
             assert str(path) in message_of(read, str(tmp_path / 'run'))
+
+
+def test_recording_of_more_files_than_may_be_open_is_read(tmp_path, monkeypatch):
+    """Files whose times overlap are merged."""
+    monkeypatch.setattr(os, 'fsync', lambda _: None)
+    count = 60
+    with BagWriter(tmp_path / 'run', live=True) as bag:
+        for number in range(1, count + 1):
+            for log_time in (100 * number, 100 * number + 150):
+                bag.write_frame(frame(number=number), log_time_ns=log_time)
+            bag.split()
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    open_files = len(os.listdir('/proc/self/fd'))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (open_files + 10, limits[1]))
+    try:
+        times = [message.log_time_ns for message in iterate_messages(tmp_path / 'run')]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert times == sorted(times) and len(times) == 2 * count
 
 
 @pytest.mark.long

@@ -61,6 +61,35 @@ def test_latched_messages_are_in_every_file(tmp_path, monkeypatch):
         assert bag.message_count == 63 + 2 * (len(files) - 1)
 
 
+def test_outdated_latched_messages_are_not_repeated(tmp_path):
+    """But those of each publisher, as soon as there are several."""
+    recording = Recording(tmp_path / 'bag', RecordingOptions(split_size=1e-6))
+    recording.start()
+    recording.add_topic(topic('/note', 1))
+    for value in ('old', 'new'):
+        recording.put('/note', text(value), START, START)
+    recording.add_topic(topic('/note', 2))
+    recording.put('/note', text('of another'), START, START)
+    recording.stop()
+    files = sorted((tmp_path / 'bag').glob('*.mcap'))
+    notes = [[m.data for m in iterate_messages(path)] for path in files]
+    assert notes == [
+        [],
+        [text('old')],
+        [text('old'), text('new')],
+        [text('old'), text('new'), text('of another')],
+    ]
+
+
+def test_topic_with_a_name_that_is_not_of_ros_does_not_end_a_recording(tmp_path):
+    recording = started(tmp_path / 'bag')
+    with pytest.raises(DataError, match="'/9lives' cannot be the name"):
+        recording.add_topic(topic('/9lives'))
+    assert recording.put('/stream', text('x'), START, START)
+    recording.stop()
+    assert not recording.fault and recording.counts == {'/stream': 1}
+
+
 def wait_until(condition):
     pause = threading.Event()
     for _ in range(1000):

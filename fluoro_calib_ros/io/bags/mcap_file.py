@@ -111,6 +111,14 @@ def channels_of_file(path: str) -> list[ChannelInfo]:
         ]
 
 
+def start_of_file(path: str) -> int:
+    """Return the time of the first message of a file [ns], 0 if unknown. Raises DataError."""
+    with _open_checked(path) as file:
+        summary = _complete_summary(file)
+        statistics = None if summary is None else summary.statistics
+        return 0 if statistics is None else statistics.message_start_time
+
+
 def messages_of_file(path: str, topics: Collection[str] | None) -> Iterator[BagMessage]:
     """Yield the messages of a file in the order of log time.
 

@@ -26,6 +26,7 @@ from .mcap_file import (
     is_foreign,
     messages_of_bag,
     messages_of_file,
+    start_of_file,
     storage_files,
 )
 from .metadata import (
@@ -186,8 +187,37 @@ def iterate_messages(
     if is_foreign(source):
         yield from messages_of_bag(source, wanted)
         return
-    streams = [messages_of_file(path, wanted) for path in storage_files(source)]
-    yield from heapq.merge(*streams, key=lambda message: message.log_time_ns)
+    paths = storage_files(source)
+    if len(paths) == 1:
+        yield from messages_of_file(paths[0], wanted)
+    else:
+        yield from _merged(paths, wanted)
+
+
+def _merged(paths: Sequence[str], topics: Collection[str] | None) -> Iterator[BagMessage]:
+    """Yield the messages of files in the order of log time.
+
+    A file is opened when its first message is due, as a split recording may have more files than
+    a process may open.
+    """
+    streams: dict[int, Iterator[BagMessage]] = {}
+    # Next message of each file; None: the file is not open
+    queue: list[tuple[int, int, BagMessage | None]] = [
+        (start_of_file(path), number, None) for number, path in enumerate(paths)
+    ]
+    heapq.heapify(queue)
+    while queue:
+        _, number, message = queue[0]
+        if message is None:
+            streams[number] = messages_of_file(paths[number], topics)
+        else:
+            yield message
+        following = next(streams[number], None)
+        if following is None:
+            heapq.heappop(queue)
+            del streams[number]
+        else:
+            heapq.heapreplace(queue, (following.log_time_ns, number, following))
 
 
 def topics_of(source: PathLike) -> dict[str, TopicInfo]:

@@ -19,7 +19,7 @@ from ...errors import DataError
 from ...options import option, validate_options
 from ..access import PathLike
 from .metadata import Definition
-from .writer import BagWriter
+from .writer import BagWriter, check_topic_name
 
 SMALL_BYTES = 65536  # larger messages are taken for images
 LARGE_SHARE = 0.9  # share of the queue for large messages, so that images do not displace frames
@@ -80,10 +80,14 @@ class PlayingOptions:
     )
 
 
+MAX_LATCHED = 100
+
+
 class TopicToRecord(NamedTuple):
     """A topic, its type, the offered QoS profiles, and the definition of the type.
 
-    latched: number of its last messages that are repeated at the start of each file.
+    latched: number of its last messages that are repeated at the start of each file, at most
+    MAX_LATCHED: those that a node would receive which begins to listen then.
     """
 
     name: str
@@ -139,7 +143,11 @@ class Recording:
         self._thread.start()
 
     def add_topic(self, topic: TopicToRecord) -> None:
-        """Add a topic; must precede its first message."""
+        """Add a topic before its first message, or change the number of its latched messages.
+
+        Raises DataError for a name that is not that of a ROS topic.
+        """
+        check_topic_name(topic.name, self._writer.path)
         with self._condition:
             self._queue.append(topic)
             self._condition.notify()
@@ -221,16 +229,17 @@ class Recording:
 
     def _write(self, item: _Message | TopicToRecord) -> None:
         if isinstance(item, TopicToRecord):
+            if item.name not in self._topics:
+                self._writer.add_topic(item.name, item.msg_type, item.qos, item.definition)
             self._topics[item.name] = item
-            self._writer.add_topic(item.name, item.msg_type, item.qos, item.definition)
             if item.latched:
-                self._latched[item.name] = deque(maxlen=item.latched)
+                self._latched.setdefault(item.name, deque(maxlen=MAX_LATCHED))
             return
         if self._is_full():
             self._writer.split()
             self._file_start = time.monotonic()
-            for messages in self._latched.values():
-                for message in messages:
+            for topic, messages in self._latched.items():
+                for message in list(messages)[-self._topics[topic].latched :]:
                     self._write_message(message._replace(received_ns=item.received_ns))
         self._write_message(item)
         self.counts[item.topic] += 1

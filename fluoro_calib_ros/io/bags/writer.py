@@ -190,8 +190,7 @@ class BagWriter:
         Without a definition the type must be known to this program. Raises DataError for an
         invalid name and an unknown type.
         """
-        if not _TOPIC_NAME.fullmatch(topic):
-            raise DataError(f'{self.path}: {topic!r} cannot be the name of a ROS topic')
+        check_topic_name(topic, self.path)
         definition = definition or known_definition(msg_type)
         profiles = [PROFILES[qos]] if isinstance(qos, str) else list(qos)
         self._topics[topic] = BagTopic(topic, msg_type, profiles, definition)
@@ -276,6 +275,12 @@ class BagWriter:
             self._file.close()
         if not self._live:
             shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def check_topic_name(topic: str, path: str) -> None:
+    """Raise DataError unless a topic of a bag has a name of ROS."""
+    if not _TOPIC_NAME.fullmatch(topic):
+        raise DataError(f'{path}: {topic!r} cannot be the name of a ROS topic')
 
 
 def check_replaceable(path: str, overwrite: bool) -> None:

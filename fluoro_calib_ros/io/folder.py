@@ -196,7 +196,7 @@ def _settle(leftover: str, target: str) -> None:
     elif is_old and not os.path.lexists(target + PREVIOUS):
         os.rename(leftover, target + PREVIOUS)
     elif suffix == 'swap' and is_old:
-        _keep_as_previous(leftover, target)
+        keep_as_previous(leftover, target)
     else:
         shutil.rmtree(leftover)
 
@@ -224,11 +224,11 @@ def _put_in_place(staging: str, target: str) -> None:
         _delete(complete)
         raise
     sync_folder(parent)
-    _keep_as_previous(complete, target)
+    keep_as_previous(complete, target)
     sync_folder(parent)
 
 
-def _keep_as_previous(folder: str, target: str) -> None:
+def keep_as_previous(folder: str, target: str) -> None:
     """Keep a folder as NAME.previous; delete the one that had this name."""
     previous = target + PREVIOUS
     if os.path.lexists(previous):

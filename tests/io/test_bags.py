@@ -438,7 +438,11 @@ def test_only_bags_are_overwritten_and_only_on_request(tmp_path):
     assert 'is not overwritten' in message_of(write_bag, path)
     write_bag(path, [frame()], overwrite=True)
     assert_holds(path, [frame()])
-    assert os.listdir(tmp_path) == ['run']
+    assert sorted(os.listdir(tmp_path)) == ['run', 'run.previous']
+    assert_holds(tmp_path / 'run.previous', some_frames())
+    (tmp_path / 'run.previous/notes.txt').write_text('precious')
+    with pytest.raises(DataError, match=r'notes\.txt'):
+        write_bag(path, overwrite=True)
     (tmp_path / 'run/thesis.doc').write_text('precious')
     for options in ({'live': True, 'overwrite': True}, {'overwrite': True}):
         with pytest.raises(DataError, match=r'thesis\.doc'):

@@ -202,7 +202,7 @@ def test_run_killed_between_two_renames_is_finished_by_the_next(tmp_path, monkey
     child = fork()
     if not child:
         folder_module.os.rename = rename
-        folder_module._keep_as_previous = lambda *_: os._exit(9)
+        folder_module.keep_as_previous = lambda *_: os._exit(9)
         write(path, 'third')
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 9 << 8

@@ -22,6 +22,7 @@ from mcap.writer import CompressionType, Writer
 from ...errors import DataError
 from ...exposures.frame import Frame
 from ..access import PathLike, os_errors, sync_folder, write_text
+from ..folder import PREVIOUS, keep_as_previous
 from .metadata import (
     NO_MESSAGE_NS,
     PROFILES,
@@ -56,7 +57,7 @@ class BagWriter:
     path : path-like
         Folder of the bag.
     overwrite : bool
-        Whether to replace an existing bag.
+        Whether to replace an existing bag, which is kept as NAME.previous.
     live : bool
         For recording: the bag is written under its final name, and messages written before an
         exception are kept.
@@ -86,10 +87,10 @@ class BagWriter:
 
     def __enter__(self) -> BagWriter:
         check_replaceable(self.path, self._overwrite)
+        if self._overwrite:
+            check_replaceable(self.path + PREVIOUS, overwrite=True)
         try:
             with os_errors(self.path, NOT_WRITTEN):
-                if self._live and os.path.isdir(self.path):
-                    shutil.rmtree(self.path)
                 os.makedirs(self._folder)
                 self._open_file()
         except BaseException:
@@ -303,7 +304,7 @@ def check_replaceable(path: str, overwrite: bool) -> None:
 
 
 def _put_in_place(folder: str, path: str, overwrite: bool) -> None:
-    """Rename a finished folder; with overwrite, delete the replaced bag afterwards."""
+    """Rename a finished folder; with overwrite, keep the replaced bag as NAME.previous."""
     sync_folder(folder)
     backup = f'{folder}.old'
     replaced = overwrite and os.path.isdir(path)
@@ -315,6 +316,6 @@ def _put_in_place(folder: str, path: str, overwrite: bool) -> None:
         if replaced:
             os.rename(backup, path)
         raise
-    sync_folder(os.path.dirname(path))
     if replaced:
-        shutil.rmtree(backup, ignore_errors=True)
+        keep_as_previous(backup, path)
+    sync_folder(os.path.dirname(path))

@@ -50,7 +50,7 @@ class Block:
     def strings(self, name: str) -> list[str]:
         """Return the cells of a column without surrounding blanks."""
         cells = list(map(str.strip, map(itemgetter(self.header.index(name)), self.rows)))
-        return list(map(_from_text, cells)) if "'" in ''.join(cells) else cells
+        return list(map(from_text, cells)) if "'" in ''.join(cells) else cells
 
     def floats(self, name: str, if_missing: str = '') -> NDArray[np.float64]:
         """Return a column (n,) of finite numbers. Raises DataError.
@@ -237,7 +237,8 @@ def _as_texts(row: Iterable[Any]) -> list[Any]:
     ]
 
 
-def _from_text(cell: str) -> str:
+def from_text(cell: str) -> str:
+    """Return a cell without the apostrophe that `as_text` adds."""
     return cell[1:] if cell[:1] == "'" and as_text(cell[1:]) == cell else cell
 
 
@@ -257,7 +258,7 @@ def _numbered_rows(path: PathLike, text: str) -> Iterator[tuple[int, list[str]]]
     last_line = 0
     try:
         for row in reader:
-            if len(row) > 1 or (row and row[0].strip()):
+            if any(map(str.strip, row)):
                 yield last_line + 1, [decimal_point(c.strip()) for c in row] if has_commas else row
             last_line = reader.line_num
     except csv.Error as error:
@@ -266,8 +267,8 @@ def _numbered_rows(path: PathLike, text: str) -> Iterator[tuple[int, list[str]]]
 
 def _separator(text: str) -> str:
     """Return the separator of a table: a semicolon if its header has one and no comma."""
-    lines = (line for line in io.StringIO(text) if not line.lstrip().startswith('#'))
-    header = next((line for line in lines if line.strip()), '')
+    lines = (match[0].strip() for match in re.finditer(r'[^\r\n]+', text))
+    header = next((line for line in lines if line and not line.startswith('#')), '')
     return ';' if ';' in header and ',' not in header else ','
 
 

@@ -39,7 +39,15 @@ from ..exposures.phantom import first_repeated, is_positive
 from ..limits import MAX_FRAMES
 from ..rows import chosen_rows, joined_rows
 from .access import PathLike, check_safe_name
-from .csv_table import Block, NamedColumn, Table, read_all, read_blocks, write_table
+from .csv_table import (
+    Block,
+    NamedColumn,
+    Table,
+    from_text,
+    read_all,
+    read_blocks,
+    write_table,
+)
 
 ANGLE = 'angle_deg'
 CORRECTED_BY = 'corrected_by'  # id of the calibration that corrected the image points
@@ -470,7 +478,7 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     points = PointsFile(
         path=path,
         header=header,
-        rows=table.rows,
+        rows=[list(map(from_text, row)) for row in table.rows],
         lines=table.lines,
         uv=np.column_stack([table.floats_or_nan('u'), table.floats_or_nan('v')]),
         sigma=_sigma(table) if 'sigma' in header else None,

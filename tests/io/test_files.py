@@ -700,6 +700,25 @@ def corrected_rows(tmp_path, text, calibrations):
     return [row.split(',') for row in (tmp_path / 'out.csv').read_text().splitlines()]
 
 
+def test_names_like_formulas_stay_as_they_are(tmp_path):
+    text = "note,u,v\n'-lateral,100,125\n''-x,100,125\n'plain,100,125\nit's,100,125\n"
+    _, *rows = corrected_rows(tmp_path, text, {'a': some_calibration()})
+    assert [row[0] for row in rows] == ["'-lateral", "''-x", "'plain", "it's"]
+
+
+@pytest.mark.parametrize('end', ['\n', '\r\n', '\r'])
+def test_tables_of_spreadsheets_are_read(tmp_path, end):
+    """Also with semicolons and decimal commas; empty rows at the end are of no importance."""
+    rows = ('fluoroscope;exposure;target_id;u;v', 'a;1;1;5,5;5,5', ';;;;')
+    path = text_file(tmp_path, 'o.csv', end.join(['# note, by hand', *rows]))
+    (frame,) = read_observations_csv(path, (100, 100))['a']
+    assert frame.uv.tolist() == [[5.5, 5.5]]
+    lines = [row.replace(',', '.').replace(';', ',') for row in rows]
+    path = text_file(tmp_path, 'o.csv', end.join(lines) + end)
+    (frame,) = read_observations_csv(path, (100, 100))['a']
+    assert frame.uv.tolist() == [[5.5, 5.5]]
+
+
 def test_points_are_corrected_and_other_columns_kept(tmp_path):
     calibration = some_calibration()
     header, good, empty, off, outside = corrected_rows(

@@ -8,13 +8,14 @@ from __future__ import annotations
 import io
 import re
 import zlib
+from typing import Any
 
 import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from ..errors import DataError
+from ..errors import DataError, quoted
 from ..findings import Kind
 from ..limits import read_limits
 
@@ -67,6 +68,39 @@ def decode(content: bytes | bytearray | memoryview | NDArray[np.uint8]) -> np.nd
     if image is None:
         raise DataError('this is not an image that can be decoded, or it is damaged')
     return as_grey(image)
+
+
+# Pixel type of each encoding; 8UC1 and 16UC1 are the same, but do not state that they are grey.
+PIXEL_TYPES = {'mono8': np.uint8, '8UC1': np.uint8, 'mono16': np.uint16, '16UC1': np.uint16}
+
+
+def raw_image(message: Any) -> np.ndarray:
+    """Return the grey image (h, w) uint8 or uint16 of a sensor_msgs/Image, or of its fields.
+
+    The array shares the memory of the message if byte order and row step allow. Raises DataError
+    for another encoding, and if the bytes are not those of an image of its size.
+    """
+    pixel_type = PIXEL_TYPES.get(message.encoding)
+    if pixel_type is None:
+        raise DataError(
+            f'its encoding {quoted(message.encoding)} is not mono8 or mono16',
+            kind=Kind.IMAGE_ENCODING,
+        )
+    dtype = np.dtype(pixel_type)
+    width, height, step = message.width, message.height, message.step
+    size = len(message.data)
+    row_size = width * dtype.itemsize
+    min_size = (height - 1) * step + row_size
+    if not width or not height or step < row_size or not min_size <= size <= height * step:
+        raise DataError(
+            f'{size} bytes in rows of {step} are not an image of {width} x {height} px of '
+            f'{message.encoding}'
+        )
+    image = np.ndarray((height, width), dtype, message.data, strides=(step, dtype.itemsize))
+    if dtype == np.uint16 and message.is_bigendian:
+        return image.byteswap()
+    # OpenCV does not accept rows that begin within a pixel.
+    return image if step % dtype.itemsize == 0 else image.copy()
 
 
 def as_grey(image: np.ndarray) -> np.ndarray:

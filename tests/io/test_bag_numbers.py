@@ -14,6 +14,7 @@ from mcap.opcode import Opcode
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.stamps import ExposureNumbers
+from fluoro_calib_ros.images.codec import raw_image
 from fluoro_calib_ros.io.bags import recording, salvage
 from fluoro_calib_ros.io.bags.mcap_file import MAGIC, RECORD
 from fluoro_calib_ros.io.bags.metadata import (
@@ -29,7 +30,6 @@ from fluoro_calib_ros.io.bags.reader import (
     COMPRESSED_IMAGE,
     IMAGE,
     _is_restart,
-    _pixels,
     _renumbered,
     image_topics,
     images_of,
@@ -322,25 +322,33 @@ def image(encoding='mono16', step=10, width=4, height=2, big=0, data=None):
         width=width,
         height=height,
         is_bigendian=big,
-        data=np.arange(step * height) if data is None else data,
+        data=np.asarray(np.arange(step * height) if data is None else data, np.uint8),
     )
 
 
 @pytest.mark.parametrize(('big', 'first'), [(0, 0x0100), (1, 0x0001)])
 def test_rows_of_an_image_begin_after_its_step(big, first):
-    grey = _pixels(image(big=big))
+    grey = raw_image(image(big=big))
     assert grey.shape == (2, 4) and grey.dtype == np.uint16 and grey[0, 0] == first
     assert grey[1, 0] - grey[0, 0] == 10 * 0x0101
-    assert _pixels(image('8UC1', step=4)).tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    assert _pixels(image(data=np.arange(25))).shape == (2, 4)
+    assert raw_image(image('8UC1', step=4)).tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert raw_image(image(data=np.arange(18))).shape == (2, 4), 'the last row is not padded'
 
 
 @pytest.mark.parametrize(
-    'wrong', [{'step': 7}, {'data': np.arange(19)}, {'encoding': 'rgb8'}, {'width': 6}]
+    'wrong',
+    [
+        {'step': 7},
+        {'data': np.arange(17)},
+        {'data': np.arange(21)},
+        {'encoding': 'rgb8'},
+        {'width': 6},
+        {'width': 0, 'height': 0, 'step': 0},
+    ],
 )
-def test_image_with_too_few_bytes_is_refused(wrong):
+def test_image_whose_bytes_are_not_of_its_size_is_refused(wrong):
     with pytest.raises(DataError):
-        _pixels(image(**wrong))
+        raw_image(image(**wrong))
 
 
 def test_images_of_a_bag_are_those_of_a_topic_of_each_fluoroscope(tmp_path):

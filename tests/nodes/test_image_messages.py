@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 
-from fluoro_calib_ros.nodes.messages.image import ImageConverter
+from fluoro_calib_ros.images.codec import raw_image
 
 
 @pytest.mark.parametrize('big_endian', [False, True])
@@ -23,5 +23,5 @@ def test_image_has_the_values_of_the_message(encoding, kind, big_endian):
         is_bigendian=int(big_endian),
         data=stored.tobytes(),
     )
-    image = ImageConverter._view(ImageConverter.__new__(ImageConverter), message)
+    image = raw_image(message)
     np.testing.assert_array_equal(image, values)

@@ -304,7 +304,6 @@ def _is_same_definition(recorded: Definition) -> bool:
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
-PIXEL_TYPES = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '16UC1': 'u2'}
 
 
 # Images that this package publishes of those of a fluoroscope.
@@ -379,29 +378,13 @@ def images_of(source: PathLike, fluoroscope: str, numbers: ExposureNumbers) -> I
 
 def _decoded(data: bytes, kind: str) -> np.ndarray | DataError:
     """Return the image of a message, or the error with which it cannot be read."""
-    from ...images.codec import decode  # loads OpenCV, which a player does not need
+    from ...images.codec import decode, raw_image  # loads OpenCV, which a player does not need
 
     try:
         content = from_cdr(data, kind)
-        return decode(content.data) if kind == COMPRESSED_IMAGE else _pixels(content)
+        return decode(content.data) if kind == COMPRESSED_IMAGE else raw_image(content)
     except DataError as error:
         return error
-
-
-def _pixels(message: Any) -> np.ndarray:
-    """Return the grey values (h, w) of an Image. Raises DataError."""
-    if message.encoding not in PIXEL_TYPES:
-        raise DataError(f'the encoding {message.encoding} is not one of {", ".join(PIXEL_TYPES)}')
-    order = '>' if message.is_bigendian else '<'
-    dtype = np.dtype(order + PIXEL_TYPES[message.encoding])
-    if message.step < message.width * dtype.itemsize:
-        raise DataError(f'a row has {message.step} bytes, too few for {message.width} px')
-    data = np.asarray(message.data, dtype=np.uint8)
-    if len(data) < message.step * message.height:
-        raise DataError('the image has fewer pixels than its header states')
-    rows = data[: message.step * message.height].reshape(message.height, message.step)
-    grey = np.ascontiguousarray(rows[:, : message.width * dtype.itemsize]).view(dtype)
-    return grey.astype(dtype.newbyteorder('='), copy=False)
 
 
 # Angles of C-arms in a bag, from the states of their joints.

@@ -16,13 +16,11 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from ...correction.fluoroscope_calibration import FluoroscopeCalibration
-from ...errors import DataError, quoted
+from ...errors import DataError
 from ...findings import Kind
-from ...images.codec import decode, encode
+from ...images.codec import PIXEL_TYPES, decode, encode, raw_image
 from ..runtime.diagnostics import TOO_LARGE, Refused
 
-# Pixel type of each encoding; 8UC1 and 16UC1 are the same, but do not state that they are grey.
-PIXEL_TYPES = {'mono8': np.uint8, '8UC1': np.uint8, 'mono16': np.uint16, '16UC1': np.uint16}
 ENCODINGS = {np.dtype(np.uint8): 'mono8', np.dtype(np.uint16): 'mono16'}
 COMPRESSIONS = {'png': '.png', 'jpeg': '.jpg'}
 # Kinds of refusals.
@@ -70,7 +68,12 @@ class ImageConverter:
         if isinstance(message, CompressedImage):
             image = self._decompress(message)
             return image, ENCODINGS[image.dtype]
-        return self._view(message), message.encoding
+        try:
+            return raw_image(message), message.encoding
+        except DataError as error:
+            is_encoding = error.finding.kind is Kind.IMAGE_ENCODING
+            kind = 'encoding' if is_encoding else 'image size'
+            raise self.refusal(kind, message, str(error)) from None
 
     def prepare_output(
         self, header: Header, encoding: str, shape: tuple[int, ...]
@@ -91,31 +94,6 @@ class ImageConverter:
             self._output = {(encoding, shape): prepared}  # a stream has one encoding
         prepared[0].header = header
         return prepared
-
-    def _view(self, message: Image) -> np.ndarray:
-        pixel_type = PIXEL_TYPES.get(message.encoding)
-        if pixel_type is None:
-            cause = f'its encoding {quoted(message.encoding)} is not mono8 or mono16'
-            raise self.refusal('encoding', message, cause)
-        dtype = np.dtype(pixel_type)
-        width = message.width
-        height = message.height
-        step = message.step
-        size = len(message.data)
-        row_size = width * dtype.itemsize
-        min_size = (height - 1) * step + row_size
-        if not width or not height or step < row_size or not min_size <= size <= height * step:
-            raise self.refusal(
-                'image size',
-                message,
-                f'{size} bytes in rows of {step} are not an image of {width} x '
-                f'{height} px of {message.encoding}',
-            )
-        image = np.ndarray((height, width), dtype, message.data, strides=(step, dtype.itemsize))
-        if dtype == np.uint16 and message.is_bigendian:
-            return image.byteswap()
-        # OpenCV does not accept rows that begin within a pixel.
-        return image if step % dtype.itemsize == 0 else image.copy()
 
     def _decompress(self, message: CompressedImage) -> np.ndarray:
         try:

@@ -20,16 +20,14 @@ from numpy.typing import NDArray
 
 from ..photogrammetry.rotations import matrix_from_vector
 from .radiographs import (
-    DARK,
     MARGIN_PX,
-    OPEN_BEAM,
     RadiographSettings,
     Radiography,
     chords,
     clutter,
     detected,
     focal_spot,
-    illumination,
+    grey_of_counts,
 )
 from .rig import VirtualFluoroscope, VirtualRig
 
@@ -170,11 +168,8 @@ class MarkerRadiography(Radiography):
         name = sum(fluoroscope.name.encode())
         rng = np.random.default_rng([seed, 22, name])
         self._discs = _discs(rng, fluoroscope.name, markers, frames)
-        width, height = fluoroscope.image_size
-        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-        self._open = illumination(grid, (width, height), self.settings)
         if self.settings.clutter:
-            self._open *= clutter(rng, self._open.shape, self.settings.clutter)
+            self._open_beam *= clutter(rng, self._open_beam.shape, self.settings.clutter)
         self._plane = self._rays[..., :2].astype(np.float32)
         coarse = self._rays[::BONE_STEP, ::BONE_STEP].reshape(-1, 3)
         coarse = coarse / np.linalg.norm(coarse, axis=1, keepdims=True)
@@ -214,7 +209,7 @@ class MarkerRadiography(Radiography):
         points += np.asarray(shift_mm)
         unit_pose = (np.eye(3), np.zeros(3))
         uv = np.array([self.centres(moment_points, unit_pose) for moment_points in points])
-        light = self._open.copy()
+        light = self._open_beam.copy()
         if scene.bones:
             light *= self._bones(self.markers.poses(frame))
         self._trace(light, points[:, rows], uv[:, rows], self.markers.diameter_mm[rows] / 2)
@@ -243,6 +238,7 @@ class MarkerRadiography(Radiography):
         low = np.maximum(low, 0)
         high = np.minimum(high, fluoroscope.image_size)
         spots = focal_spot(self.settings.focal_spot_mm)
+        is_point = len(spots) == 1
         for rows, (u0, v0), (u1, v1) in _regions(low, high):
             column = (np.arange((u1 - u0) * FINE) + 0.5) / FINE - 0.5 + u0
             row = (np.arange((v1 - v0) * FINE) + 0.5) / FINE - 0.5 + v0
@@ -252,7 +248,7 @@ class MarkerRadiography(Radiography):
             detector = np.dstack([plane, np.full(grid[0].shape, self.settings.detector_mm)])
             total_transmission = np.zeros_like(grid[0])
             for number, centres in enumerate(sensor):
-                for spot in spots[1 + number % 2 :: 2][:SPOT_POINTS]:
+                for spot in spots if is_point else spots[1 + number % 2 :: 2][:SPOT_POINTS]:
                     transmission = np.ones_like(total_transmission)
                     for bead in rows:
                         # Only around the bead: regions of several beads are large.
@@ -266,7 +262,7 @@ class MarkerRadiography(Radiography):
             coarse = cv2.resize(
                 total_transmission, (u1 - u0, v1 - v0), interpolation=cv2.INTER_AREA
             )
-            light[v0:v1, u0:u1] *= coarse / (MOMENTS * SPOT_POINTS)
+            light[v0:v1, u0:u1] *= coarse / (MOMENTS * (1 if is_point else SPOT_POINTS))
 
     def _bones(
         self, poses: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -317,13 +313,7 @@ class MarkerRadiography(Radiography):
         noise = rng.standard_normal(expected.shape, dtype=np.float32) * np.sqrt(expected)
         if settings.noise_blur_px:
             noise = cv2.GaussianBlur(noise, (0, 0), settings.noise_blur_px)
-        largest = 2**settings.bits - 1
-        signal = (expected + noise) / settings.photons
-        grey = largest * (DARK + (OPEN_BEAM - DARK) * signal)
-        if settings.inverted:
-            grey = largest - grey
-        dtype = np.uint8 if settings.bits == 8 else np.uint16
-        return np.clip(np.rint(grey), 0, largest).astype(dtype)
+        return grey_of_counts(expected + noise, settings)
 
 
 def _regions(

@@ -346,6 +346,11 @@ def _digitised(
             (counts - expected).astype(np.float32), (0, 0), settings.noise_blur_px
         )
         counts = expected + noise
+    return grey_of_counts(counts, settings)
+
+
+def grey_of_counts(counts: NDArray[np.float32], settings: RadiographSettings) -> np.ndarray:
+    """Return grey values (h, w) of numbers of photons (h, w)."""
     largest = 2**settings.bits - 1
     grey = largest * (DARK + (OPEN_BEAM - DARK) * counts / settings.photons)
     if settings.inverted:

@@ -197,3 +197,19 @@ def test_a_bone_absorbs_along_its_wall():
     length = 2 / np.linalg.norm(along / axes)
     assert light[MIDDLE] == pytest.approx(np.exp(-BONE_ATTENUATION * length * 0.22), rel=1e-3)
     assert light.max() == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize('focal_spot_mm', [0.0, 0.6])
+def test_beads_absorb_in_their_shadow_alone(focal_spot_mm):
+    """With a point as focal spot, too."""
+    scene = MarkerScene(clusters=1, hidden=0.0, bones=False)
+    markers = MovingMarkers(scene, 1)
+    settings = replace(MARKER_SETTINGS, focal_spot_mm=focal_spot_mm, round_field=False)
+    taken = MarkerRadiography(virtual_rig(1).fluoroscopes[0], markers, settings)
+    light, uv, _ = taken._light(1, np.arange(scene.markers))
+    far = np.ones(light.shape, bool)
+    for u, v in np.rint(uv[:, taken.in_field(uv[0], 30.0)]).astype(int).reshape(-1, 2):
+        far[v - 20 : v + 21, u - 20 : u + 21] = False
+    relative = light / taken._open_beam
+    np.testing.assert_allclose(relative[far], 1.0, rtol=1e-5)
+    assert 0 < relative.min() < 0.2 and (relative > 0.99).mean() > 0.9

@@ -20,7 +20,7 @@ from tifffile import TiffFile, TiffFileError
 from ..errors import DataError, ErrorsAt
 from ..exposures.frame import MAX_ANGLE
 from ..images.codec import as_grey, check_size, decode
-from .access import PathLike, os_error_reason, read_bytes
+from .access import PathLike, check_regular_file, os_error_reason, read_bytes
 from .csv_table import read_blocks
 from .recordings import read_cine_header, read_cine_images, read_dicom_header, read_dicom_images
 
@@ -137,6 +137,7 @@ def count_pages(path: PathLike) -> int:
     Raises DataError for a file that cannot be read, is not a TIFF file, is cut off or damaged, and
     for pages that are too large.
     """
+    check_regular_file(path)
     try:
         with TiffFile(path) as file:
             count = len(file.pages)

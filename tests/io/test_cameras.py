@@ -290,6 +290,22 @@ def test_camera_info_is_that_of_ros(tmp_path):
         assert found.rotation is None
 
 
+@pytest.mark.parametrize('size', [('-5', '960'), ('1280', '1.5'), ('0', '960')])
+@pytest.mark.parametrize('kind', ['camera_info', 'anipose'])
+def test_image_size_that_is_not_one_is_refused(tmp_path, kind, size):
+    path = tmp_path / ('a_camera_info.yaml' if kind == 'camera_info' else 'a.toml')
+    registry.write(
+        tmp_path if kind == 'camera_info' else path, kind, Content(cameras=cameras()), MM
+    )
+    text = path.read_text()
+    for name, number, wrong in zip(('image_width: ', 'image_height: '), SIZE, size):
+        text = text.replace(f'{name}{number}', f'{name}{wrong}')
+    text = text.replace(str(list(SIZE)), f'[{", ".join(size)}]')
+    path.write_text(text)
+    with pytest.raises(DataError, match='is not of whole numbers above 0'):
+        registry.read(path, MM)
+
+
 def test_opencv_reads_the_file_itself(tmp_path):
     registry.write(tmp_path, 'opencv', Content(cameras=cameras()), MM)
     storage = cv2.FileStorage(str(tmp_path / 'b_opencv.yaml'), cv2.FILE_STORAGE_READ)

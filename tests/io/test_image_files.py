@@ -472,6 +472,13 @@ def test_bad_source(one, tmp_path, capfd, name):
     assert out.read_text() == 'earlier' and len(os.listdir(tmp_path)) == 2
 
 
+@pytest.mark.parametrize('suffix', ['png', 'tif', 'avi', 'dcm'])
+def test_pipe_is_not_read(one, tmp_path, capfd, suffix):
+    source = tmp_path / f'in.{suffix}'
+    os.mkfifo(source)
+    assert 'this is a pipe' in said(capfd, source, one, tmp_path / 'out.png')
+
+
 @pytest.mark.parametrize('ending, codec', [('.avi', 'FFV1'), ('.mkv', 'FFV1'), ('.mp4', 'mp4v')])
 def test_cut_video(one, tmp_path, capfd, ending, codec):
     source = tmp_path / f'in{ending}'

@@ -187,12 +187,12 @@ def _anipose_camera(where: str, table: Mapping[str, Any], mm: float) -> Camera:
         raise DataError(f'{where}: fisheye cameras are not supported')
     matrix = _numbers_of(where, table, 'matrix', (3, 3))
     check_matrix(where, matrix)
-    size = _numbers_of(where, table, 'size', (2,))
+    size = _size(where, _numbers_of(where, table, 'size', (2,)))
     distortion = _numbers_of(where, table, 'distortions', None).ravel()
     return Camera(
         str(table.get('name', where)),
         matrix,
-        image_size=(int(size[0]), int(size[1])),
+        image_size=size,
         rotation=matrix_from_vector(_numbers_of(where, table, 'rotation', (3,))),
         translation_mm=from_units(_numbers_of(where, table, 'translation', (3,)), mm),
         distortion=tuple(distortion.tolist()) if distortion.any() else (),
@@ -214,6 +214,16 @@ def _numbers_of(
     if not np.isfinite(value).all():
         raise DataError(f'{where}: {key} has a number that is not finite')
     return value
+
+
+def _size(where: object, values: NDArray[np.float64]) -> tuple[int, int]:
+    """Return width and height of an image. Raises DataError unless they are whole and above 0."""
+    width, height = values.tolist()
+    if not (values > 0).all() or (values % 1).any():
+        raise DataError(
+            f'{where}: the image size {width:g} x {height:g} px is not of whole numbers above 0'
+        )
+    return int(width), int(height)
 
 
 def _write_anipose(path: Path, content: Content, settings: FileSettings) -> Written:
@@ -282,6 +292,7 @@ def _read_camera_info(path: Path, settings: FileSettings) -> Content:
     matrix = _entry_matrix(path, document, 'camera_matrix', (3, 3))
     check_matrix(path, matrix)
     size = [_numbers_of(path, document, key, ()) for key in ('image_width', 'image_height')]
+    image_size = _size(path, np.array(size))
     model = document.get('distortion_model', _MODELS[0])
     distortion = np.zeros(0)
     if 'distortion_coefficients' in document:
@@ -291,7 +302,7 @@ def _read_camera_info(path: Path, settings: FileSettings) -> Content:
     camera = Camera(
         str(document.get('camera_name', path.stem)),
         matrix,
-        (int(size[0]), int(size[1])),
+        image_size,
         distortion=tuple(distortion.tolist()) if distortion.any() else (),
     )
     return Content(cameras=(camera,))

@@ -249,10 +249,20 @@ def format_float(value: float) -> str:
 
 def _numbered_rows(path: PathLike, text: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a table that are not blank, with their row numbers. Raises DataError."""
-    separator = _separator(text)
     lines: Iterable[str] = io.StringIO(text, newline='')
     if '#' in text:  # replace comments by blank lines, to keep the row numbers
         lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
+    return split_rows(path, lines, _separator(text), 'CSV')
+
+
+def split_rows(
+    path: PathLike, lines: Iterable[str], separator: str, title: str
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield number and cells of the rows of a table that are not blank.
+
+    With semicolons, numbers have decimal commas, which become points. Raises DataError for lines
+    that are not what the title says.
+    """
     reader = csv.reader(lines, delimiter=separator, strict=True)
     has_commas = separator == ';'
     last_line = 0
@@ -262,7 +272,7 @@ def _numbered_rows(path: PathLike, text: str) -> Iterator[tuple[int, list[str]]]
                 yield last_line + 1, [decimal_point(c.strip()) for c in row] if has_commas else row
             last_line = reader.line_num
     except csv.Error as error:
-        raise DataError(f'{path}, row {reader.line_num}: this is not CSV ({error})') from None
+        raise DataError(f'{path}, row {reader.line_num}: this is not {title} ({error})') from None
 
 
 def _separator(text: str) -> str:

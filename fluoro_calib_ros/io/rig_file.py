@@ -23,7 +23,7 @@ All keys are optional; paths are relative to the folder of the file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -62,57 +62,63 @@ def read_rig_file(path: Path) -> RigFile:
     """Read a rig.toml. Raises DataError that names file and key."""
     document = read_toml(path)
     _check_keys(path, document, KEYS)
-    names = _names(path, document.get('fluoroscopes'))
+    for key, (is_valid, expected) in _EXPECTED.items():
+        if key in document and not is_valid(document[key]):
+            raise DataError(f'{path}, key {key}: expected {expected}')
+    names = document.get('fluoroscopes')
+    size = document.get('image_size')
+    sd = document.get('phantom_sd')
+    max_age = document.get('angle_max_age')
     return RigFile(
         path,
         names,
-        image_size=_size(path, document.get('image_size')),
+        image_size=None if size is None else (size[0], size[1]),
         phantom=_path(path, 'phantom', document.get('phantom')),
         calibration=_path(path, 'calibration', document.get('calibration')),
-        units=_units(path, document.get('units')),
-        phantom_sd=_phantom_sd(path, document.get('phantom_sd')),
+        units=document.get('units'),
+        phantom_sd=None if sd is None else float(sd),
         angle_joint=_joint(path, document.get('angle_joint'), names),
-        angle_max_age=_max_age(path, document.get('angle_max_age')),
-        about=_about(path, document.get('about')),
+        angle_max_age=None if max_age is None else float(max_age),
+        about=_about(path, document['about']) if 'about' in document else None,
     )
 
 
-def _names(path: Path, value: Any) -> list[str] | None:
-    if value is None:
-        return None
+def _are_names(value: Any) -> bool:
     valid = isinstance(value, list) and value and all(isinstance(v, str) and v for v in value)
-    if not valid or len(set(value)) < len(value):
-        raise DataError(
-            f'{path}, key fluoroscopes: expected a list of different names, such as ["a", "b"]'
-        )
-    return list(value)
+    return bool(valid) and len(set(value)) == len(value)
 
 
-def _size(path: Path, value: Any) -> tuple[int, int] | None:
-    if value is None:
-        return None
-    are_integers = isinstance(value, list) and all(type(v) is int and v > 0 for v in value)
-    if not are_integers or len(value) != 2:
-        raise DataError(
-            f'{path}, key image_size: expected width and height [px], such as [1024, 1024]'
-        )
-    return value[0], value[1]
+def _is_size(value: Any) -> bool:
+    valid = isinstance(value, list) and all(type(v) is int and v > 0 for v in value)
+    return valid and len(value) == 2
 
 
-def _units(path: Path, value: Any) -> str | None:
-    if value is not None and value not in ('mm', 'cm', 'm'):
-        raise DataError(f'{path}, key units: expected "mm", "cm" or "m"')
-    return value
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, int | float)
 
 
-def _phantom_sd(path: Path, value: Any) -> float | None:
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 100:
-        raise DataError(
-            f'{path}, key phantom_sd: expected a standard deviation [mm], such as 0.05'
-        )
-    return float(value)
+def _is_max_age(value: Any) -> bool:
+    """Return whether a value is one of the option angle_max_age."""
+    from ..exposures.angles import AngleOptions  # every command loads this module
+
+    try:
+        return _is_number(value) and bool(AngleOptions(angle_max_age=float(value)))
+    except (ValueError, OverflowError):
+        return False
+
+
+# Test of the value of a key, and what is expected.
+_EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    'fluoroscopes': (_are_names, 'a list of different names, such as ["a", "b"]'),
+    'image_size': (_is_size, 'width and height [px], such as [1024, 1024]'),
+    'units': (lambda value: value in ('mm', 'cm', 'm'), '"mm", "cm" or "m"'),
+    'phantom_sd': (
+        lambda value: _is_number(value) and 0 < value <= 100,
+        'a standard deviation [mm], such as 0.05',
+    ),
+    'angle_max_age': (_is_max_age, 'a time [s], such as 0.5'),
+    'about': (lambda value: isinstance(value, dict), 'a table of texts and numbers'),
+}
 
 
 def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:
@@ -144,26 +150,8 @@ def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:
     return value.strip()
 
 
-def _max_age(path: Path, value: Any) -> float | None:
-    """Return the option angle_max_age [s]."""
-    from ..exposures.angles import AngleOptions  # every command loads this module
-
-    if value is None:
-        return None
-    try:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError
-        return AngleOptions(angle_max_age=float(value)).angle_max_age
-    except (ValueError, OverflowError):
-        raise DataError(f'{path}, key angle_max_age: expected a time [s], such as 0.5') from None
-
-
-def _about(path: Path, value: Any) -> dict[str, str] | None:
+def _about(path: Path, value: Mapping[str, Any]) -> dict[str, str]:
     """Return texts for the report, by key."""
-    if value is None:
-        return None
-    if not isinstance(value, dict):
-        raise DataError(f'{path}, key about: expected a table of texts and numbers')
     for key, text in value.items():
         if not isinstance(text, str | int | float) or len(f'{key}{text}') > MAX_ABOUT_TEXT:
             raise DataError(

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,7 +21,7 @@ from ...exposures.names import Names, number_names, without_trivial
 from ...findings import sentence_of
 from ...limits import MAX_ROWS
 from ..access import PathLike, atomic_file, check_rows, read_text
-from ..csv_table import decimal_comma_advice, decimal_point, without_zeros
+from ..csv_table import decimal_comma_advice, split_rows, without_zeros
 from .content import Bodies, Content, FileSettings, Points
 
 MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
@@ -133,7 +132,9 @@ def table_of(path: PathLike, text: str, separator: str | None = None) -> list[Ro
     if separator == ' ':
         rows = [Row(path, n, line.split()) for n, line in enumerate(text.splitlines(), 1)]
     else:
-        rows = _separated(path, text, separator or separator_of(text))
+        lines = io.StringIO(text, newline='')
+        split = split_rows(path, lines, separator or separator_of(text), 'a table')
+        rows = [Row(path, n, list(map(str.strip, cells))) for n, cells in split]
     rows = [row for row in rows if any(row.cells)]
     if not rows:
         raise DataError(f'{path}: the file has no rows')
@@ -144,20 +145,6 @@ def separator_of(text: str) -> str:
     """Return the separator found in the first row that is not blank."""
     first_line = next((line for line in text.splitlines() if line.strip()), '')
     return next((mark for mark in ';\t' if mark in first_line), ',')
-
-
-def _separated(path: PathLike, text: str, separator: str) -> list[Row]:
-    reader = csv.reader(io.StringIO(text, newline=''), delimiter=separator, strict=True)
-    rows = []
-    try:
-        for cells in reader:
-            stripped = [cell.strip() for cell in cells]
-            if separator == ';':
-                stripped = [decimal_point(cell) for cell in stripped]
-            rows.append(Row(path, reader.line_num, stripped))
-    except csv.Error as error:
-        raise DataError(f'{path}, row {reader.line_num}: this is not a table ({error})') from None
-    return rows
 
 
 def read_frames(path: PathLike) -> tuple[Row, list[Row], int]:

@@ -30,7 +30,6 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 
 from ..options import option
-from .recorder_node import type_hash_text
 from .runtime.diagnostics import RateLimitedLogger, StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode
@@ -40,8 +39,7 @@ from .runtime.topics import (
     RECORDED_LATCHED_DEPTH,
     TopicDiscovery,
     adapted_qos,
-    definition_of,
-    installed_type,
+    is_outdated,
 )
 
 HEAD_S = 5.0  # time limit for receiving the head of a request
@@ -214,7 +212,7 @@ class BridgeNode(ParameterNode):
         super().__init__('bridge_node')
         settings = _NODE.declare(self)
         self._foxglove = _foxglove()
-        self._topics_of_graph = TopicDiscovery(self, filter(None, settings.topics))
+        self._topics_of_graph = TopicDiscovery(self, filter(None, settings.topics), 'shown')
         self._shown: dict[str, _Shown] = {}
         self._lock = threading.Lock()
         self._readers: Counter[str] = Counter()  # by topic; changed by server threads
@@ -285,22 +283,21 @@ class BridgeNode(ParameterNode):
             elif shown.topic not in read_topics and shown.subscription is not None:
                 self.destroy_subscription(shown.subscription)
                 shown.subscription = None
-            elif shown.topic in newcomers and shown.is_latched:
+            elif shown.subscription is not None and (
+                (shown.topic in newcomers and shown.is_latched)
+                or is_outdated(self, shown.subscription)
+            ):
                 self.destroy_subscription(shown.subscription)
                 self._subscribe(shown)
 
     def _discover(self) -> None:
-        for topic, types, publishers in self._topics_of_graph.new():
-            kind = installed_type(types[0]) if len(types) == 1 else None
-            if kind is None:
-                self.get_logger().warning(f'{topic} is not shown: its type is not installed')
-                continue
-            definition = definition_of(types[0], type_hash_text(publishers[0]))
+        for topic in self._topics_of_graph.new():
+            definition = topic.definition
             schema = self._foxglove.Schema(
-                name=types[0], encoding=definition.encoding, data=definition.text.encode()
+                name=topic.type, encoding=definition.encoding, data=definition.text.encode()
             )
-            channel = self._foxglove.Channel(topic, schema=schema, message_encoding='cdr')
-            self._shown[topic] = _Shown(topic, kind, channel)
+            channel = self._foxglove.Channel(topic.name, schema=schema, message_encoding='cdr')
+            self._shown[topic.name] = _Shown(topic.name, topic.kind, channel)
 
     def _subscribe(self, shown: _Shown) -> None:
         qos = adapted_qos(self.get_publishers_info_by_topic(shown.topic), IMAGE_DEPTH)

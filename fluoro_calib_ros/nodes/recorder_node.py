@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..errors import DataError
 from ..io.bags.recording import Recording, RecordingOptions, TopicToRecord, lost_text
@@ -35,10 +33,11 @@ from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.streams import FaultHandlers, StreamReader
 from .runtime.topics import (
     DISCOVERY_S,
+    PublishedTopic,
     TopicDiscovery,
+    adaptation_message,
     adapted_qos,
-    definition_of,
-    installed_type,
+    received_by_all,
 )
 
 JOINT_STATES = 'joint_states'
@@ -100,17 +99,17 @@ class RecorderNode(ParameterNode):
         options = _RECORDING.declare(self)
         if not self._settings.folder:
             raise StartError('parameter folder is not set: it names the bag to record')
+        topics = [topic for topic in self._settings.topics if topic]
+        if topics and self._settings.angle_joint:
+            topics.append(JOINT_STATES)
+        self._topics_of_graph = TopicDiscovery(self, topics, 'recorded')  # may refuse names
         try:
             self._recording = Recording(expand_path(self._settings.folder), options)
             self._recording.start()
         except DataError as error:
             raise StartError(str(error)) from None
         self.failed = False
-        topics = [topic for topic in self._settings.topics if topic]
-        if topics and self._settings.angle_joint:
-            topics.append(JOINT_STATES)
-        self._topics_of_graph = TopicDiscovery(self, topics)
-        self._topics: dict[str, str] = {}  # types by topic
+        self._topics: set[str] = set()
         self._latched: dict[str, TopicToRecord] = {}
         self._overrun: Counter[str] = Counter()  # messages lost at the input by topic
         self._limited_logger = RateLimitedLogger(self.get_logger())
@@ -122,6 +121,7 @@ class RecorderNode(ParameterNode):
                 self._on_reader_error,
                 overrun=self._on_overrun,
             ),
+            received_by_all,
         )
         self._reader.start()
         self._diagnostics = DiagnosticsPublisher(self)
@@ -132,42 +132,32 @@ class RecorderNode(ParameterNode):
 
     def _discover(self) -> None:
         """Subscribe to topics that have appeared since the last call."""
-        for topic, types, publishers in self._topics_of_graph.new():
-            self._subscribe(topic, types, publishers)
-        for topic, entry in self._latched.items():
-            count = latched_count(self.get_publishers_info_by_topic(topic))
+        for topic in self._topics_of_graph.new():
+            self._subscribe(topic)
+        for name, entry in self._latched.items():
+            count = latched_count(self.get_publishers_info_by_topic(name))
             if count > entry.latched:
-                self._latched[topic] = entry._replace(latched=count)
-                self._recording.add_topic(self._latched[topic])
+                self._latched[name] = entry._replace(latched=count)
+                self._recording.add_topic(self._latched[name])
 
-    def _subscribe(
-        self, topic: str, types: Sequence[str], publishers: Sequence[TopicEndpointInfo]
-    ) -> None:
-        """Record a topic, or log why it cannot be recorded."""
-        kind = installed_type(types[0]) if len(types) == 1 else None
-        if kind is None:
-            reason = (
-                f'it has the types {", ".join(types)}'
-                if len(types) > 1
-                else f'the type {types[0]} is not installed'
-            )
-            self.get_logger().warning(f'{topic} is not recorded: {reason}')
-            return
-        qos = adapted_qos(publishers, DEPTH)
+    def _subscribe(self, published: PublishedTopic) -> None:
+        """Record a topic."""
+        topic = published.name
+        qos = adapted_qos(published.publishers, DEPTH)
         is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         entry = TopicToRecord(
             topic,
-            types[0],
-            [qos_document(publisher.qos_profile) for publisher in publishers],
-            definition_of(types[0], type_hash_text(publishers[0])),
-            latched_count(publishers) if is_latched else 0,
+            published.type,
+            [qos_document(publisher.qos_profile) for publisher in published.publishers],
+            published.definition,
+            latched_count(published.publishers) if is_latched else 0,
         )
         try:
             self._recording.add_topic(entry)
         except DataError as error:
             self.get_logger().warning(f'{topic} is not recorded: {error}')
             return
-        self._topics[topic] = types[0]
+        self._topics.add(topic)
         if is_latched:
             self._latched[topic] = entry
 
@@ -177,8 +167,8 @@ class RecorderNode(ParameterNode):
             if not self._recording.put(topic, data, received, sent):
                 self._limited_logger.error(self._loss())
 
-        self._reader.subscribe(kind, topic, on_message, qos, decode=lambda data: data)
-        self.get_logger().info(f'recording {topic} [{types[0]}]')
+        self._reader.subscribe(published.kind, topic, on_message, qos, decode=lambda data: data)
+        self.get_logger().info(f'recording {topic} [{published.type}]')
 
     def _loss(self) -> str:
         """Return a message about dropped messages and the cause, '' if none was dropped."""
@@ -199,7 +189,9 @@ class RecorderNode(ParameterNode):
         self.get_logger().fatal(text)
 
     def _on_timer(self) -> None:
-        """Publish the diagnostics."""
+        """Adapt subscriptions to publishers that have restarted; publish the diagnostics."""
+        for topic, qos in self._reader.adapt().items():
+            self.get_logger().warning(adaptation_message(topic, qos))
         recording = self._recording
         if recording.fault:
             self._limited_logger.error(recording.fault)
@@ -224,7 +216,7 @@ class RecorderNode(ParameterNode):
             self.get_logger().error(loss or self._recording.fault)
         if self._overrun:
             self.get_logger().error(self._lost_at_input())
-        missing = sorted(self._topics_of_graph.wanted - set(self._topics))
+        missing = sorted(self._topics_of_graph.wanted - self._topics)
         if missing:
             self.get_logger().warning(f'nobody has published {", ".join(missing)}')
         self.get_logger().info(
@@ -260,14 +252,6 @@ def qos_document(profile: QoSProfile) -> dict[str, Any]:
 def _duration(duration: Duration) -> dict[str, int]:
     seconds, nanoseconds = divmod(duration.nanoseconds, 10**9)
     return {'sec': seconds, 'nsec': nanoseconds}
-
-
-def type_hash_text(publisher: TopicEndpointInfo) -> str:
-    """Return the type hash of a publisher, '' if the middleware does not provide it."""
-    type_hash = publisher.topic_type_hash
-    if type_hash is None or type_hash.version != 1 or not any(type_hash.value):
-        return ''
-    return f'RIHS01_{bytes(type_hash.value).hex()}'
 
 
 main = partial(run, RecorderNode)

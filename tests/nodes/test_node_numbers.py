@@ -53,7 +53,7 @@ from fluoro_calib_ros.nodes.frame_validation import (
 from fluoro_calib_ros.nodes.image_stream import ExposureQueue, ImageStream
 from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
 from fluoro_calib_ros.nodes.reconstruction_output import PointsCounter
-from fluoro_calib_ros.nodes.recorder_node import qos_document, type_hash_text
+from fluoro_calib_ros.nodes.recorder_node import qos_document
 from fluoro_calib_ros.nodes.rig_input import RigInput
 from fluoro_calib_ros.nodes.runtime import diagnostics
 from fluoro_calib_ros.nodes.runtime.diagnostics import (
@@ -62,7 +62,7 @@ from fluoro_calib_ros.nodes.runtime.diagnostics import (
     RefusalLog,
     Refused,
 )
-from fluoro_calib_ros.nodes.runtime.topics import adapted_qos
+from fluoro_calib_ros.nodes.runtime.topics import adapted_qos, type_hash_text
 from fluoro_calib_ros.reconstruction.intersection import (
     FAILED,
     OUTSIDE,

@@ -54,6 +54,41 @@ def test_messages_that_the_queue_has_displaced_are_counted(graph, latched):
     assert lost == expected
 
 
+def test_messages_of_another_publisher_are_not_lost(graph):
+    """Each publisher numbers its messages: after one has ended, the other continues its own."""
+    client = graph.client
+    heard = []
+    lost = []
+    faults = FaultHandlers(
+        heard.append,
+        lambda *fault: heard.append(fault),
+        heard.append,
+        overrun=lambda _, count: lost.append(count),
+    )
+    reader = StreamReader(client, faults)
+    qos = QoSProfile(depth=DEPTH)
+    first = client.create_publisher(Int32, 'shared', qos)
+    for number in range(COUNT):  # before anybody reads
+        first.publish(Int32(data=number))
+    reader.subscribe(Int32, 'shared', lambda message, _: heard.append(message.data), qos)
+    reader.start()
+    second = client.create_publisher(Int32, 'shared', qos)
+
+    def publish(publisher):
+        client.wait_until(publisher.get_subscription_count, what='the subscription')
+        count = len(heard)
+        publisher.publish(Int32())
+        client.wait_until(lambda: len(heard) > count, what='the message')
+
+    for publisher in (first, second):
+        publish(publisher)
+    client.destroy_publisher(second)
+    client.wait_until(lambda: client.count_publishers(first.topic_name) == 1)
+    publish(first)
+    reader.stop()
+    assert not lost
+
+
 def test_messages_that_have_arrived_are_handled_at_the_end_where_that_is_asked_for(graph):
     client = graph.client
     heard = []

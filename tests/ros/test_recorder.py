@@ -6,9 +6,14 @@
 import signal
 
 import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_graph import NAMES, Process, entry_point, value_of
 from rosbags.rosbag2 import Reader
-from std_msgs.msg import String
+from std_msgs.msg import Int32, String
 
 from fluoro_calib_ros.io.bags.metadata import type_hash
 from fluoro_calib_ros.io.bags.reader import read_frames, topics_of
@@ -123,7 +128,71 @@ def test_recorder_says_why_it_cannot_start(graph, tmp_path):
         ({}, 'parameter folder is not set'),
         ({'folder': tmp_path / 'there'}, 'already exists'),
         ({'folder': '/proc/bag'}, 'cannot be written'),
+        ({'folder': tmp_path / 'new', 'topics': '[a/target-observations]'}, 'a/target-observ'),
     ):
         process = graph.start('recorder_node', parameters, wait=False)
         assert process.wait() == 1
         assert sentence in process.log and 'Traceback' not in process.log
+    assert not (tmp_path / 'new').exists()  # so that the corrected command may use it
+
+
+BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+RELIABLE = QoSProfile(depth=100)
+
+
+@pytest.mark.parametrize(
+    'profiles', [(RELIABLE, BEST_EFFORT), (BEST_EFFORT, RELIABLE), (latched_qos(), RELIABLE)]
+)
+def test_publisher_that_restarts_with_another_quality_of_service_is_recorded(
+    graph, tmp_path, profiles
+):
+    client = graph.client
+    topic = f'{graph.namespace}/note'
+    recorder = graph.start('recorder_node', {'folder': tmp_path / 'bag', 'topics': f'[{topic}]'})
+    for number, profile in enumerate(profiles, 1):
+        publisher = client.create_publisher(String, topic, profile)
+
+        def offered():
+            (info,) = client.get_subscriptions_info_by_topic(topic)
+            got = info.qos_profile
+            return got.reliability, got.durability
+
+        client.wait_until(lambda: client.get_subscriptions_info_by_topic(topic))
+        client.wait_until(lambda: offered() == (profile.reliability, profile.durability))
+        client.wait_until(publisher.get_subscription_count, what='the subscription')
+        client.wait_until_known_to('recorder_node')
+        publisher.publish(String(data='x'))
+        client.wait_for_diagnostics('recorder_node', lambda s: recorded(s) == number, 'recorder')
+        client.destroy_publisher(publisher)
+        client.wait_until(lambda: not client.count_publishers(topic))
+    assert f'topic {topic}: the subscription is now' in recorder.log
+
+
+@pytest.fixture
+def peer(graph):
+    """Node of another participant, which may use other types than the client."""
+    context = Context()
+    domain_id = int(graph.environment['ROS_DOMAIN_ID'])
+    rclpy.init(args=[], context=context, domain_id=domain_id)
+    node = Node('peer', context=context)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_types_of_subscribers_do_not_prevent_a_recording(graph, peer, tmp_path):
+    """Types of publishers that differ do, until one of them has ended."""
+    client = graph.client
+    topic = f'{graph.namespace}/note'
+    peer.create_subscription(Int32, topic, print, 10)
+    other = peer.create_publisher(Int32, topic, 10)
+    publisher = client.create_publisher(String, topic, 10)
+    client.wait_until(lambda: client.count_publishers(topic) == 2)
+    recorder = graph.start('recorder_node', {'folder': tmp_path / 'bag', 'topics': f'[{topic}]'})
+    wait = client.wait_until
+    wait(lambda: f'{topic} is not recorded: it has the types std_msgs/msg/Int32' in recorder.log)
+    peer.destroy_publisher(other)
+    wait(publisher.get_subscription_count, what='the subscription')
+    client.wait_until_known_to('recorder_node')
+    publisher.publish(String(data='x'))
+    client.wait_for_diagnostics('recorder_node', lambda s: recorded(s) == 1, 'recorder')

@@ -382,7 +382,12 @@ def test_best_effort_publisher_is_received(graph, calibrated, exposures):
 
     client.wait_until(received, what='frames from the relay')
     for node in nodes:
-        assert 'a/target_observations: its publishers offer best effort only' in node.log
+        assert 'a/target_observations: the subscription is now best effort' in node.log
+    client.destroy_publisher(publisher)
+    publisher = client.create_publisher(TargetObservations, 'relay', 100)
+    for node in nodes:
+        wait = client.wait_until
+        wait(lambda node=node: 'observations: the subscription is now reliable' in node.log)
 
 
 def test_mixed_publishers_are_reported(graph, tmp_path):

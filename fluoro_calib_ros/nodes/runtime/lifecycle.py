@@ -37,7 +37,7 @@ from .diagnostics import (
 )
 from .parameters import ParameterNode
 from .streams import FaultHandlers, StreamReader
-from .topics import best_effort_message, publisher_conflict, qos_overrides
+from .topics import adaptation_message, publisher_conflict, qos_overrides
 
 T = TypeVar('T')
 
@@ -216,8 +216,8 @@ class StreamNode(ManagedNode):
         """Return a message for every topic with an incompatible publisher, and log them."""
         messages: dict[str, str] = {}
         for reader in self.readers:
-            for topic in reader.accept_best_effort():
-                self.get_logger().warning(best_effort_message(topic))
+            for topic, qos in reader.adapt().items():
+                self.get_logger().warning(adaptation_message(topic, qos))
             messages.update(reader.incompatible_publishers())
         for message in messages.values():
             self.limited_logger.warning(message)

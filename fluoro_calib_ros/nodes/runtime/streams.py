@@ -19,8 +19,7 @@ from __future__ import annotations
 import threading
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable
-from copy import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -33,19 +32,20 @@ from rclpy.qos import (
     DurabilityPolicy,
     QoSCompatibility,
     QoSProfile,
-    ReliabilityPolicy,
     qos_check_compatible,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ...limits import read_limits
 from .topics import (
     OBSERVATION_DEPTH,
+    differs,
     incompatible_qos_message,
-    needs_best_effort,
     qos_overrides,
+    reliable_if_offered,
 )
 
 WAIT_NS = 50_000_000  # interval at which the thread checks whether it has to end
@@ -55,14 +55,17 @@ MAX_BATCH = 8
 DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
 
 
+Adaptation = Callable[[QoSProfile, Sequence[TopicEndpointInfo]], QoSProfile]
+
 REMEMBERED = 1000  # exposures that are kept for messages about them that arrive later
 
 
 def remember(
     table: OrderedDict[Any, Any], key: object, value: object, most: int = REMEMBERED
 ) -> None:
-    """Store a value by its key; beyond `most` entries, drop the oldest."""
+    """Store a value by its key as the newest; beyond `most` entries, drop the oldest."""
     table[key] = value
+    table.move_to_end(key)
     if len(table) > most:
         table.popitem(last=False)
 
@@ -91,20 +94,15 @@ class _Route(NamedTuple):
     subscription: Subscription
     decode: Callable[..., Any]
     callback: Callable[..., Any]
-    handle: Any
-    is_latched: bool
+    is_overridden: bool  #: whether the user has chosen another reliability
 
-    @classmethod
-    def of(
-        cls,
-        topic: str,
-        subscription: Subscription,
-        decode: Callable[..., Any],
-        callback: Callable[..., Any],
-    ) -> _Route:
-        """Return the route of a subscription."""
-        latched = subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        return cls(topic, subscription, decode, callback, subscription.handle, is_latched=latched)
+    @property
+    def handle(self) -> Any:
+        return self.subscription.handle
+
+    @property
+    def is_latched(self) -> bool:
+        return self.subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
 @dataclass(frozen=True)
@@ -126,17 +124,24 @@ class FaultHandlers:
 
 
 class StreamReader:
-    """Subscriptions of a node, served by a dedicated thread between start() and stop()."""
+    """Subscriptions of a node, served by a dedicated thread between start() and stop().
 
-    def __init__(self, node: Node, faults: FaultHandlers) -> None:
+    adaptation: profile of a subscription, of its present profile and its publishers.
+    """
+
+    def __init__(
+        self, node: Node, faults: FaultHandlers, adaptation: Adaptation = reliable_if_offered
+    ) -> None:
         self._node = node
         self._faults = faults
+        self._adaptation = adaptation
         self._faults_of: dict[str, FaultHandlers] = {}  # of topics with their own handlers
         self._group = _ReaderGroup()
         self._routes: list[_Route] = []
         self._max_bytes: dict[str, int] = {}  # by topic
         self._first: set[str] = set()  # topics of take_first()
-        self._sequence: dict[str, int] = {}  # number of the last message by topic
+        # number of the last message by topic, and of its publishers when it was last irregular
+        self._sequence: dict[str, tuple[int, int]] = {}
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -166,10 +171,12 @@ class StreamReader:
         max_bytes : int, optional
             Larger messages are dropped before they are decoded; by default the limit for images.
         """
+        requested = qos.reliability
         subscription = self._subscription(kind, topic, qos, qos_overrides())
+        is_overridden = subscription.qos_profile.reliability != requested
         self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
         decode = decode or (lambda data: deserialize_message(data, kind))
-        self._routes.append(_Route.of(topic, subscription, decode, callback))
+        self._routes.append(_Route(topic, subscription, decode, callback, is_overridden))
 
     def _subscription(
         self,
@@ -207,29 +214,30 @@ class StreamReader:
             for route in self._routes
         }
 
-    def accept_best_effort(self) -> list[str]:
-        """Use best effort for topics that are only published so; return these topics.
+    def adapt(self) -> dict[str, QoSProfile]:
+        """Renew subscriptions whose publishers offer something else than before.
 
-        Camera drivers often publish so, and a reliable subscription receives nothing from them. To
-        be called from the thread that created the subscriptions.
+        Returns the new profiles by topic. To be called from the thread that created the
+        subscriptions.
         """
-        lowered = [
-            number
-            for number, route in enumerate(self._routes)
-            if needs_best_effort(self._node, route.subscription)
-        ]
-        if not lowered:
-            return []
+        renewed = {}
+        for number, (_, subscription, *_, is_overridden) in enumerate(self._routes):
+            publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
+            qos = self._adaptation(subscription.qos_profile, publishers)
+            if differs(qos, subscription.qos_profile) and not is_overridden:
+                renewed[number] = qos
+        if not renewed:
+            return {}
         self._halt()
-        for number in lowered:
-            topic, old, decode, callback, *_ = self._routes[number]
-            qos = copy(old.qos_profile)
-            qos.reliability = ReliabilityPolicy.BEST_EFFORT
-            self._node.destroy_subscription(old)
-            new = self._subscription(old.msg_type, topic, qos)
-            self._routes[number] = _Route.of(topic, new, decode, callback)
+        for number, qos in renewed.items():
+            route = self._routes[number]
+            self._take_pending(route)
+            self._node.destroy_subscription(route.subscription)
+            self._sequence.pop(route.topic, None)
+            new = self._subscription(route.subscription.msg_type, route.topic, qos)
+            self._routes[number] = route._replace(subscription=new)
         self.start()
-        return [self._routes[number].topic for number in lowered]
+        return {self._routes[number].topic: qos for number, qos in renewed.items()}
 
     def incompatible_publishers(self) -> dict[str, str]:
         """Return a message for every topic with a publisher that offers less than is requested.
@@ -259,13 +267,17 @@ class StreamReader:
         take_pending: whether messages that have already arrived are handled, too.
         """
         self._halt()
-        if take_pending:
-            self._stopping.clear()
-            for route in self._routes:
-                self._drain(route, [], route.subscription.qos_profile.depth)
+        for route in self._routes:
+            if take_pending:
+                self._take_pending(route)
         for route in self._routes:
             self._node.destroy_subscription(route.subscription)
         self._routes = []
+
+    def _take_pending(self, route: _Route) -> None:
+        """Handle the messages of a route that have already arrived; the thread is stopped."""
+        self._stopping.clear()
+        self._drain(route, [], route.subscription.qos_profile.depth)
 
     def _halt(self) -> None:
         """Stop the thread."""
@@ -336,10 +348,13 @@ class StreamReader:
         faults = self._of(route.topic)
         if faults.overrun is None or number is None or route.is_latched:
             return
-        lost = number - self._sequence.get(route.topic, number - 1) - 1
-        self._sequence[route.topic] = number
-        # Several publishers number their messages separately; so does a restarted one.
-        if lost > 0 and self._node.count_publishers(route.subscription.topic_name) == 1:
+        last, before = self._sequence.get(route.topic, (number, 0))
+        lost = number - last - 1
+        publishers = before
+        if lost:  # several publishers number their messages separately; so does a restarted one
+            publishers = self._node.count_publishers(route.subscription.topic_name)
+        self._sequence[route.topic] = number, publishers
+        if lost > 0 and before == publishers == 1:
             faults.overrun(route.topic, lost)
 
     def _handle(self, route: _Route, data: bytes, info: dict[str, Any]) -> None:

@@ -9,8 +9,9 @@ import os
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 from ament_index_python.packages import (
     PackageNotFoundError,
@@ -30,6 +31,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.type_support import check_for_type_support
+from rclpy.validate_topic_name import validate_topic_name
 
 from ...errors import DataError
 from ...io.access import read_text
@@ -61,47 +63,62 @@ def wait_for_readers(
         stop.wait(SETTLING_S)
 
 
-def needs_best_effort(node: Node, subscription: Subscription) -> bool:
-    """Return whether a reliable subscription has publishers, all of them best effort."""
-    if subscription.qos_profile.reliability != ReliabilityPolicy.RELIABLE:
-        return False
-    publishers = node.get_publishers_info_by_topic(subscription.topic_name)
-    return bool(publishers) and all(
-        p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for p in publishers
-    )
+def resolved_names(node: Node, topics: Iterable[str]) -> set[str]:
+    """Return the full names of topics as a node uses them. Raises NameValidationException."""
+    return {node.resolve_topic_name(topic) for topic in topics if validate_topic_name(topic)}
 
 
-def best_effort_message(topic: str) -> str:
-    """Return the message about a topic that is from now on subscribed to as best effort."""
-    return (
-        f'topic {topic}: its publishers offer best effort only; the subscription is now best '
-        'effort, so lost messages are not sent again'
-    )
+class PublishedTopic(NamedTuple):
+    """A topic of the graph that can be received."""
+
+    name: str
+    type: str  #: name of the message type
+    kind: type[Any]  #: class of the message type
+    definition: Definition
+    publishers: Sequence[TopicEndpointInfo]
 
 
 class TopicDiscovery:
     """Finds the topics of the graph that have a publisher, each once.
 
     wanted: topic names as the node uses them; if empty, all topics except hidden ones (with a name
-    part that begins with an underscore).
+    part that begins with an underscore). purpose: what the node does with topics, such as
+    'recorded'; it warns of topics that cannot be received. Raises NameValidationException.
     """
 
-    def __init__(self, node: Node, wanted: Iterable[str]) -> None:
+    def __init__(self, node: Node, wanted: Iterable[str], purpose: str) -> None:
         self._node = node
+        self._purpose = purpose
         self._found: set[str] = set()
-        self.wanted = {node.resolve_topic_name(topic) for topic in wanted}
+        self._refused: dict[str, str] = {}  # reasons by topic
+        self.wanted = resolved_names(node, wanted)
 
-    def new(self) -> Iterator[tuple[str, list[str], list[TopicEndpointInfo]]]:
-        """Yield topics that were not found before, with their types and publishers."""
-        for topic, types in self._node.get_topic_names_and_types():
-            hidden = any(part.startswith('_') for part in topic.split('/'))
-            is_wanted = topic in self.wanted if self.wanted else not hidden
-            if not is_wanted or topic in self._found:
+    def new(self) -> Iterator[PublishedTopic]:
+        """Yield topics that were not found before and can be received."""
+        for name, _ in self._node.get_topic_names_and_types():
+            hidden = any(part.startswith('_') for part in name.split('/'))
+            is_wanted = name in self.wanted if self.wanted else not hidden
+            publishers = ()
+            if is_wanted and name not in self._found:
+                publishers = self._node.get_publishers_info_by_topic(name)
+            if not publishers:
                 continue
-            publishers = self._node.get_publishers_info_by_topic(topic)
-            if publishers:
-                self._found.add(topic)
-                yield topic, types, publishers
+            types = sorted({publisher.topic_type for publisher in publishers})
+            kind = installed_type(types[0])
+            if len(types) > 1:
+                self._refuse(name, f'it has the types {", ".join(types)}')
+            elif kind is None:
+                self._refuse(name, f'the type {types[0]} is not installed')
+            else:
+                self._found.add(name)
+                definition = definition_of(types[0], type_hash_text(publishers[0]))
+                yield PublishedTopic(name, types[0], kind, definition, publishers)
+
+    def _refuse(self, name: str, reason: str) -> None:
+        """Warn once that a topic cannot be received."""
+        if self._refused.get(name) != reason:
+            self._refused[name] = reason
+            self._node.get_logger().warning(f'{name} is not {self._purpose}: {reason}')
 
 
 def publisher_conflict(node: Node, topic: str) -> str:
@@ -155,6 +172,14 @@ def installed_type(name: str) -> type[Any] | None:
     except (PackageNotFoundError, ValueError, ImportError, AttributeError):
         return None
     return message_type
+
+
+def type_hash_text(publisher: TopicEndpointInfo) -> str:
+    """Return the type hash of a publisher, '' if the middleware does not provide it."""
+    type_hash = publisher.topic_type_hash
+    if type_hash is None or type_hash.version != 1 or not any(type_hash.value):
+        return ''
+    return f'RIHS01_{bytes(type_hash.value).hex()}'
 
 
 def definition_of(name: str, type_hash: str) -> Definition:
@@ -239,6 +264,54 @@ def adapted_qos(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfi
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def received_by_all(current: QoSProfile, publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
+    """Return the profile of a subscription that is to receive the messages of all publishers."""
+    qos = copy(current)
+    if publishers:
+        offered = adapted_qos(publishers, current.depth)
+        qos.reliability = offered.reliability
+        qos.durability = offered.durability
+    return qos
+
+
+def reliable_if_offered(
+    current: QoSProfile, publishers: Sequence[TopicEndpointInfo]
+) -> QoSProfile:
+    """Return the profile of a subscription with the reliability on which all publishers agree.
+
+    Camera drivers often publish as best effort, and a reliable subscription receives nothing then.
+    """
+    qos = copy(current)
+    offered = {publisher.qos_profile.reliability for publisher in publishers}
+    for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT):
+        if offered == {reliability}:
+            qos.reliability = reliability
+    return qos
+
+
+def differs(one: QoSProfile, other: QoSProfile) -> bool:
+    """Return whether two profiles differ in reliability or durability."""
+    return (one.reliability, one.durability) != (other.reliability, other.durability)
+
+
+def is_outdated(node: Node, subscription: Subscription) -> bool:
+    """Return whether a subscription must be renewed to receive all publishers; see adapted_qos."""
+    publishers = node.get_publishers_info_by_topic(subscription.topic_name)
+    current = subscription.qos_profile
+    return differs(received_by_all(current, publishers), current)
+
+
+def adaptation_message(topic: str, qos: QoSProfile) -> str:
+    """Return the message about a subscription that was renewed with another profile."""
+    best_effort = qos.reliability == ReliabilityPolicy.BEST_EFFORT
+    latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    return (
+        f'topic {topic}: the subscription is now {"best effort" if best_effort else "reliable"} '
+        f'and {"latched" if latched else "volatile"}, as its publishers require'
+        + ('; lost messages are not sent again' if best_effort else '')
     )
 
 

@@ -17,7 +17,7 @@ calibrate (calibration_services), heal (healing_services), and save and load
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from functools import cache, partial
 
 from fluoro_calib_msgs.msg import DriftStatus, TargetObservations
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -165,6 +165,7 @@ class CalibrationNode(StreamNode):
         stamp_ns = nanoseconds_from_stamp(frame)
         needed = bool(self._settings.angles.angle_joint)
 
+        @cache  # asked for by each part that needs it, and counted once
         def angle() -> float | None:
             return self._angles.of_frame(name, stamp_ns, needed=needed)
 
@@ -209,6 +210,7 @@ class CalibrationNode(StreamNode):
         verdict = self._output.verdict(name)
         values = {
             **progress.collected.values(),
+            'calibration directory': self._rig.directory,
             'lost at the input': stream.overrun,
             'last fault': stream.refusals.last_fault,
             'calibration': progress.calibration_id,

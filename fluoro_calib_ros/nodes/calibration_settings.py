@@ -54,6 +54,7 @@ from .runtime.services import telling_service
 
 NOT_ACTIVE = 'the node is not active, so no frames come in'
 COLLECT_MODES = ('still', 'request')
+MAX_HEAL_S = 60.0  # maximum collection time of heal: changes show within a few seconds
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class CalibrationParameters(ManagedParameters):
         5.0,
         'how long heal collects frames where the goal gives no time',
         minimum=0.1,
-        maximum=60.0,
+        maximum=MAX_HEAL_S,
         unit='s',
     )
     heal_accept: bool = option(
@@ -180,7 +181,7 @@ def read_rig(node: ParameterNode, settings: Callable[[], CalibrationSettings]) -
             expand_path(parameters.calibration_directory)
             if parameters.calibration_directory
             else default_calibration_directory(node.get_namespace())
-        )
+        ).absolute()
         if parameters.phantom:
             survey = read_survey(expand_path(parameters.phantom))
             phantom, names = survey.phantom, survey.names

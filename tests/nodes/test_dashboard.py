@@ -5,11 +5,14 @@
 
 import asyncio
 from dataclasses import replace
+from types import SimpleNamespace as Fake
 
 import pytest
+from rclpy.task import Future
 from rich.console import Console
 from textual.widgets import Static
 
+from fluoro_calib_ros.nodes.dashboard import actions
 from fluoro_calib_ros.nodes.dashboard.state import (
     Diagnosis,
     FluoroscopeState,
@@ -161,6 +164,40 @@ def test_rate_is_that_of_the_last_seconds_and_survives_a_restart():
     meter.add(10, 0)
     meter.add(11, 30)
     assert meter.hz == pytest.approx(30.0)
+
+
+def test_rate_survives_a_clock_that_is_set_back():
+    meter = RateMeter()
+    for second in range(30):
+        meter.add(1000.0 + second, 60 * second)
+    for second in range(2):
+        meter.add(900.0 + second, 60 * (30 + second))
+    assert meter.hz == 60
+
+
+@pytest.mark.parametrize('accepted', [False, True])
+def test_calibration_is_cancelled_also_before_it_is_accepted(monkeypatch, accepted):
+    sent = Future()
+    client = Fake(server_is_ready=lambda: True, send_goal_async=lambda *_, **__: sent)
+    monkeypatch.setattr(actions, 'ActionClient', lambda *_: client)
+    cancelled = []
+    goal = Fake(
+        accepted=True,
+        cancel_goal_async=lambda: cancelled.append(1),
+        get_result_async=lambda: Fake(add_done_callback=lambda _: None),
+    )
+    lines = []
+    requests = actions.Actions(Fake(get_namespace=lambda: '/'), lines.append, lambda **_: None)
+    requests.cancel()
+    assert 'nothing runs' in lines.pop()
+    requests.request('calibrate')
+    if accepted:
+        sent.set_result(goal)
+    requests.cancel()
+    if not accepted:
+        assert not cancelled
+        sent.set_result(goal)
+    assert cancelled == [1]
 
 
 def test_cell_of_a_calibration_has_its_round_or_age_and_residuals():

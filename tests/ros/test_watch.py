@@ -8,7 +8,8 @@ import signal
 
 import numpy as np
 import pytest
-from ros_graph import NAMES, standing
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from ros_graph import BAGS, NAMES, standing
 from sensor_msgs.msg import Image
 
 from fluoro_calib_ros.nodes.dashboard.watch import SessionClient
@@ -67,6 +68,43 @@ def test_session_is_run_from_the_dashboard(graph, watch, exposures, tmp_path):
 
     assert node.end() == 0
     client.wait_until(lambda: watch.state().nodes[0].level == 'silent')
+
+
+def test_folder_of_the_results_is_the_one_that_the_node_uses(graph, watch, tmp_path):
+    graph.environment['ROS_HOME'] = str(tmp_path)  # contains the default folder
+    graph.start('calibration_node', {'phantom': BAGS / 'phantom.csv'})
+    folder = tmp_path / 'fluoro_calib' / graph.namespace.strip('/')
+    graph.client.wait_until(lambda: watch.state().results == str(folder), what='the folder')
+
+
+def test_only_what_is_reported_now_counts(graph, watch, monkeypatch):
+    """Other functions of a node are no fluoroscopes, and values that are not numbers no reason to
+    stop.
+    """
+    monkeypatch.setattr('fluoro_calib_ros.nodes.dashboard.watch.SILENT_S', 0.5)
+    client = graph.client
+    output = client.create_publisher(DiagnosticArray, '/diagnostics', 10)
+    levels = {}
+
+    def report(**functions):
+        """Report levels of functions; return the worst that is shown, and what was in its time."""
+        message = DiagnosticArray()
+        message.status = [
+            DiagnosticStatus(
+                name=f'{graph.namespace}/calibration_node: {function}',
+                level=level,
+                values=[KeyValue(key='frames received', value='n/a')] if function == 'a' else [],
+            )
+            for function, level in functions.items()
+        ]
+        output.publish(message)
+        levels.update({node.name: node.level for node in watch.state().nodes})
+        return levels.get('calibration_node')
+
+    client.wait_until(output.get_subscription_count, what='the dashboard')
+    client.wait_until(lambda: report(a=b'\0', clock=b'\1') == 'warn', what='the warning')
+    client.wait_until(lambda: report(a=b'\0') == 'ok', what='the end of the warning')
+    assert [f.name for f in watch.state().fluoroscopes] == ['a']
 
 
 @pytest.mark.parametrize('action', ['capture', 'calibrate_fast'])

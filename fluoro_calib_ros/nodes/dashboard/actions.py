@@ -47,6 +47,7 @@ class Actions:
         self._lock = threading.RLock()
         self._goal: Any = None
         self._job = ''
+        self._to_cancel = False  # as soon as the goal is accepted
         self._running: _Kind | None = None
         self._sent_at = 0.0
         calibrate = ActionClient(node, SelfCalibrate, 'self_calibrate')
@@ -66,10 +67,13 @@ class Actions:
 
     def cancel(self) -> None:
         """Cancel the running action, if it was started here."""
-        if self._goal is None:
-            self._say('cancel: nothing runs that was started here')
-            return
-        self._goal.cancel_goal_async()
+        with self._lock:
+            if not self._job:
+                self._say('cancel: nothing runs that was started here')
+                return
+            self._to_cancel = self._goal is None
+            if self._goal is not None:
+                self._goal.cancel_goal_async()
         self._say('cancel ...')
 
     def _start(self, kind: _Kind, goal: Any, text: str) -> None:
@@ -81,6 +85,7 @@ class Actions:
                 self._say(f'{kind.name}: {self._job} already')
                 return
             self._job = kind.job
+            self._to_cancel = False
             self._running = kind
             self._sent_at = time.monotonic()
         self._set(job=kind.job)
@@ -117,6 +122,8 @@ class Actions:
         with self._lock:
             self._goal = handle
             self._job = kind.job  # also if check() gave it up before
+            if self._to_cancel:
+                handle.cancel_goal_async()
         handle.get_result_async().add_done_callback(partial(self._on_result, kind))
 
     def _on_result(self, kind: _Kind, future: Future) -> None:

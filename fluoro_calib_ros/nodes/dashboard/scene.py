@@ -29,7 +29,7 @@ from ..messages.image import ImageConverter
 from ..messages.rig_orientation import orientation_from_message
 from ..runtime.diagnostics import Refused
 from ..runtime.streams import remember
-from ..runtime.topics import OBSERVATION_DEPTH, adapted_qos
+from ..runtime.topics import OBSERVATION_DEPTH, adapted_qos, is_outdated
 
 IDLE_S = 10.0  # idle time after which a topic is unsubscribed
 LARGEST_PX = 768  # maximum size of a displayed radiograph
@@ -89,6 +89,8 @@ class Scene:
         has_images = self._take_image(name, film)
         depth = OBSERVATION_DEPTH if has_images else 1  # 3 s at 30 Hz
         for message in self._taken(f'{name}/target_observations', TargetObservations, depth):
+            if not _has_rows(message, 'target_id', 'u', 'v'):  # the nodes report it
+                continue
             stamp_ns = nanoseconds_from_stamp(message.header.stamp)
             remember(film.points, stamp_ns, message, OBSERVATION_DEPTH)
             film.found_at = time.monotonic()
@@ -104,7 +106,7 @@ class Scene:
             return {}
         return {
             'stamp': str(stamp),  # numbers of JavaScript have 53 bits
-            'age': (max(film.images, default=stamp) - stamp) * 1e-9,
+            'age': max(0, next(reversed(film.images), stamp) - stamp) * 1e-9,
             'width': width,
             'height': height,
             'jpeg': f'data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}' if jpeg else '',
@@ -154,7 +156,7 @@ class Scene:
             with suppress(ValueError):  # the reconstruction node reports the reason
                 out['sources'] = _sources(orientation_from_message(orientation))
         points = self._last('reconstruction/points_with_covariance', ReconstructedPoints)
-        if points is not None:
+        if points is not None and _has_rows(points, 'target_id', 'x', 'y', 'z', 'status'):
             xyz = 1000 * np.column_stack([points.x, points.y, points.z])
             seen = np.atleast_1d(np.isfinite(xyz).all(axis=1))
             rows = zip(points.target_id, xyz.round(3).tolist(), points.status, seen.tolist())
@@ -175,7 +177,10 @@ class Scene:
         now = time.monotonic()
         for name, open_reader in list(self._readers.items()):
             if now - open_reader.used_at > IDLE_S or (
-                name == topic and open_reader.depth != depth
+                name == topic
+                and (
+                    open_reader.depth != depth or is_outdated(self._node, open_reader.subscription)
+                )
             ):
                 self._node.destroy_subscription(self._readers.pop(name).subscription)
         reader = self._readers.get(topic) or self._open(topic, kind, depth)
@@ -218,6 +223,11 @@ def _shown(film: _Film) -> int:
         return newest
     last = next(reversed(film.points))
     return max((stamp for stamp in film.images if stamp <= last), default=newest)
+
+
+def _has_rows(message: Any, *columns: str) -> bool:
+    """Return whether the arrays of a message have the same length."""
+    return len({len(getattr(message, column)) for column in columns}) == 1
 
 
 def _rows(message: TargetObservations | None) -> list[list[float]]:

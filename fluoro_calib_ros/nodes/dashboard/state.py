@@ -131,11 +131,11 @@ class Session(Protocol):
 class RateMeter:
     """Event rate, from occasional readings of a counter."""
 
-    _readings: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=100))
+    _readings: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=100))
 
-    def add(self, seconds: float, count: int) -> None:
-        """Add a reading; if the counter was reset, start again."""
-        if self._readings and count < self._readings[-1][1]:
+    def add(self, seconds: float, count: float) -> None:
+        """Add a reading; if the counter or the clock was set back, start again."""
+        if self._readings and (seconds < self._readings[-1][0] or count < self._readings[-1][1]):
             self._readings.clear()
         self._readings.append((seconds, count))
         while seconds - self._readings[0][0] > RATE_WINDOW_S:

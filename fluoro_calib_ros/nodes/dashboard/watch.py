@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -23,13 +24,12 @@ from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Capture, Orient, Reset
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from ..runtime.parameters import expand_path
+from ..runtime.main import spin
 from .actions import NO_ANSWER, Actions
 from .state import (
     ACCEPT,
@@ -78,20 +78,19 @@ class SessionClient(Node):
         self._lock = threading.RLock()
         self._fluoroscopes: dict[str, FluoroscopeState] = {}
         self._followed: set[str] = set()
-        self._functions: dict[str, dict[str, NodeState]] = {}  # by node, then by function
-        self._heard_at: dict[str, float] = {}
+        # state and when it was heard, by node, then by function
+        self._functions: dict[str, dict[str, tuple[NodeState, float]]] = {}
         self._meters: dict[tuple[str, str], RateMeter] = {}
-        self._log: deque[str] = deque(maxlen=50)
+        self._lines: deque[str] = deque(maxlen=50)
         self._session = SessionState(self.get_namespace())
-        self._points_at: tuple[int, float] | None = None  # reconstructed exposures, last change
-        self._settings = AsyncParameterClient(self, 'calibration_node')
+        self._points_at: tuple[float, float] | None = None  # reconstructed exposures, last change
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
         self._callers = {
             CAPTURE: self.create_client(Capture, 'capture'),
             ORIENT: self.create_client(Orient, 'orient'),
             **{name: self.create_client(Reset, name) for name in (RESET, ACCEPT, ROLL_BACK)},
         }
-        self._actions = Actions(self, self._say, self._set)
+        self._actions = Actions(self, self.log, self._set)
         self._asked: dict[Future, tuple[str, float]] = {}  # request, time it was made
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._check_answers, clock=steady)
@@ -111,7 +110,7 @@ class SessionClient(Node):
                 drift=drift,
                 fluoroscopes=tuple(v for _, v in sorted(self._fluoroscopes.items())),
                 nodes=tuple(self._node_states()),
-                log=tuple(self._log),
+                log=tuple(self._lines),
             )
 
     def _drift_now(self) -> tuple[str, str]:
@@ -136,13 +135,13 @@ class SessionClient(Node):
     def _call(self, action: str) -> None:
         client = self._callers[action]
         if not client.service_is_ready():
-            self._say(f'{action}: no calibration node answers in {self.get_namespace()}')
+            self.log(f'{action}: no calibration node answers in {self.get_namespace()}')
             return
         requests = {
             CAPTURE: Capture.Request,
             ORIENT: lambda: Orient.Request(frames=10),
         }
-        self._say(f'{action.replace("_", " ")} ...')
+        self.log(f'{action.replace("_", " ")} ...')
         future = client.call_async(requests.get(action, Reset.Request)())
         self._asked[future] = action, time.monotonic()
         future.add_done_callback(partial(self._on_answer, action))
@@ -156,7 +155,7 @@ class SessionClient(Node):
             for future, (action, requested_at) in list(self._asked.items()):
                 if requested_at < earliest:
                     del self._asked[future]
-                    self._say(f'{action.replace("_", " ")}: {NO_ANSWER}')
+                    self.log(f'{action.replace("_", " ")}: {NO_ANSWER}')
             self._actions.check(earliest)
 
     def _on_answer(self, action: str, future: Future) -> None:
@@ -166,7 +165,7 @@ class SessionClient(Node):
         suffix = '' if answer.success else ' failed'
         if answer.success and action in (ACCEPT, ROLL_BACK):
             self._set(diagnosis=Diagnosis())
-        self._say(f'{action.replace("_", " ")}{suffix}: {answer.message}')
+        self.log(f'{action.replace("_", " ")}{suffix}: {answer.message}')
 
     def _on_status(self, message: CalibrationStatus) -> None:
         rmse = (message.rmse_u, message.rmse_v)
@@ -194,9 +193,8 @@ class SessionClient(Node):
                 if not status.name.startswith(prefix) or node not in NODES:
                     continue
                 level = LEVELS[min(int.from_bytes(status.level, 'little'), 2)]
-                self._heard_at[node] = now
                 functions = self._functions.setdefault(node, {})
-                functions[function] = NodeState(function, level, status.message)
+                functions[function] = NodeState(function, level, status.message), now
                 values = {value.key: value.value for value in status.values}
                 self._read(node, function, values, stamp_s, status)
 
@@ -209,26 +207,29 @@ class SessionClient(Node):
         status: DiagnosticStatus,
     ) -> None:
         """Copy the values of a diagnostic status into the session state."""
-        if node == 'calibration_node':
+        received = values.get('frames received')
+        corrected = values.get('frames corrected')
+        if node == 'calibration_node' and received is not None:  # the status of a fluoroscope
             self._follow(function)
+            self._set(results=values.get('calibration directory', ''))
             self._update(
                 function,
-                frames_hz=self._rate(node, function, values.get('frames received'), stamp_s),
+                frames_hz=self._rate(node, function, received, stamp_s),
                 next_pose=values.get('next pose', ''),
                 ready=values.get('ready') == 'True',
                 verdict=values.get('verdict', ''),
                 findings=tuple(values.get('findings of the verdict', '').splitlines()),
             )
-        elif node == 'correction_node':
+        elif node == 'correction_node' and corrected is not None:
             self._update(
                 function,
-                corrected_hz=self._rate(node, function, values.get('frames corrected'), stamp_s),
+                corrected_hz=self._rate(node, function, corrected, stamp_s),
                 latency_p50_ms=_number(values.get('latency p50 [ms]')),
                 latency_p99_ms=_number(values.get('latency p99 [ms]')),
             )
         elif function == 'reconstruction':
             count = values.get('exposures reconstructed')
-            self._note_points(count)
+            self._note_points(_number(count))
             self._set(
                 points_hz=self._rate(node, function, count, stamp_s),
                 points_latency_ms=(
@@ -242,30 +243,23 @@ class SessionClient(Node):
             level = LEVELS[min(int.from_bytes(status.level, 'little'), 2)]
             self._set(drift_level=level, drift=status.message)
 
-    def _note_points(self, count: str | None) -> None:
+    def _note_points(self, count: float) -> None:
         """Record when the number of reconstructed exposures last changed."""
-        if count is not None and (self._points_at is None or self._points_at[0] != int(count)):
-            self._points_at = int(count), time.monotonic()
+        if math.isfinite(count) and (self._points_at is None or self._points_at[0] != count):
+            self._points_at = count, time.monotonic()
 
     def _follow(self, name: str) -> None:
         """Subscribe to the status of a fluoroscope, once."""
-        if not self._session.results and self._settings.services_are_ready():
-            future = self._settings.get_parameters(['calibration_directory'])
-            future.add_done_callback(self._on_settings)
         if name not in self._followed:
             self._followed.add(name)
             self.create_subscription(
                 CalibrationStatus, f'{name}/calibration_status', self._on_status, 10
             )
 
-    def _on_settings(self, future: Future) -> None:
-        (value,) = future.result().values
-        self._set(results=str(expand_path(value.string_value)) if value.string_value else '')
-
     def _rate(self, node: str, function: str, count: str | None, stamp_s: float) -> float:
         meter = self._meters.setdefault((node, function), RateMeter())
-        if count is not None:
-            meter.add(stamp_s, int(count))
+        if math.isfinite(_number(count)):
+            meter.add(stamp_s, _number(count))
         return meter.hz
 
     def _update(self, name: str, **changes: Any) -> None:
@@ -276,20 +270,22 @@ class SessionClient(Node):
         with self._lock:
             self._session = replace(self._session, **changes)
 
-    def _say(self, text: str) -> None:
+    def log(self, text: str) -> None:
+        """Add a line to the log of the session."""
         with self._lock:
-            self._log.append(f'{time.strftime("%H:%M:%S")}  {text}')
+            self._lines.append(f'{time.strftime("%H:%M:%S")}  {text}')
 
     def _node_states(self) -> Iterator[NodeState]:
         """Yield the worst level of every node, with its message."""
         now = time.monotonic()
         for node, functions in sorted(self._functions.items()):
-            silent_s = now - self._heard_at[node]
+            silent_s = now - max(heard_at for _, heard_at in functions.values())
             if silent_s > SILENT_S:
                 yield NodeState(node, 'silent', f'no message for {silent_s:.0f} s')
                 continue
-            worst = max(functions.values(), key=lambda f: LEVELS.index(f.level))
-            several = len(functions) > 1 and worst.level != 'ok'
+            current = [state for state, at in functions.values() if now - at <= SILENT_S]
+            worst = max(current, key=lambda f: LEVELS.index(f.level))
+            several = len(current) > 1 and worst.level != 'ok'
             message = f'{worst.name}: {worst.message}' if several else worst.message
             yield NodeState(node, worst.level, message)
 
@@ -307,23 +303,18 @@ def session_client(arguments: list[str]) -> Iterator[SessionClient]:
     client = SessionClient()
     executor = SingleThreadedExecutor()
     executor.add_node(client)
-    thread = threading.Thread(target=_until_shutdown(executor.spin), daemon=True)
+    ended = threading.Event()
+    thread = threading.Thread(target=spin, args=(executor, ended, client.log), daemon=True)
     thread.start()
     try:
         yield client
     finally:
-        executor.shutdown()
+        ended.set()
+        executor.create_task(lambda: None)  # makes spin_once return
         thread.join(2.0)
+        executor.shutdown()
         client.destroy_node()
         rclpy.try_shutdown()
-
-
-def _until_shutdown(spin: Callable[[], None]) -> Callable[[], None]:
-    def run() -> None:
-        with suppress(ExternalShutdownException):
-            spin()
-
-    return run
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy._rclpy_pybind11 import InvalidHandle, RCLError, UnknownROSArgsError
@@ -80,7 +80,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
         guard_services(node, node.services)
         getattr(node, 'bring_up', lambda: None)()
         try:
-            _spin(executor, node, ended)
+            spin(executor, ended, node.get_logger().error)
         finally:
             getattr(node, 'stop', lambda: None)()
         code = int(getattr(node, 'failed', False))
@@ -112,10 +112,12 @@ def _exit(code: int) -> NoReturn:
     os._exit(code)
 
 
-def _spin(executor: SingleThreadedExecutor, node: Node, ended: threading.Event) -> None:
-    """Run the callbacks of a node until it is to end.
+def spin(
+    executor: SingleThreadedExecutor, ended: threading.Event, report: Callable[[str], Any]
+) -> None:
+    """Run callbacks until `ended` is set.
 
-    An exception in a callback is logged, and the node continues: a message or request of a peer
+    An exception in a callback is reported, and the node continues: a message or request of a peer
     must not end it. If callbacks do nothing but raise, the last exception is raised.
     """
     failures: deque[float] = deque(maxlen=MAX_FAILURES)
@@ -131,9 +133,7 @@ def _spin(executor: SingleThreadedExecutor, node: Node, ended: threading.Event) 
             if len(failures) == MAX_FAILURES and failures[-1] - failures[0] < 1.0:
                 raise
             place = traceback.extract_tb(error.__traceback__)[-1]
-            node.get_logger().error(
-                f'a callback failed ({place.name}, line {place.lineno}): {one_line(error)}'
-            )
+            report(f'a callback failed ({place.name}, line {place.lineno}): {one_line(error)}')
 
 
 def _init(args: Sequence[str] | None) -> None:

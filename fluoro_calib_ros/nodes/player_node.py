@@ -32,11 +32,12 @@ from .runtime.topics import (
     observations_qos,
     qos_overrides,
     recorded_latched_qos,
+    resolved_names,
     wait_for_readers,
     wait_until_acknowledged,
 )
 
-WAIT_S = 0.02  # longest delay until a change of speed, a pause, its end or a step takes effect
+LONGEST_S = 3600.0  # of a single wait
 
 
 class Pace:
@@ -46,66 +47,80 @@ class Pace:
     """
 
     def __init__(self, rate: float, paused: bool = False) -> None:
+        self._changed = threading.Condition()
         self._rate = rate
-        self._steps = threading.Semaphore(0)
-        self._paused = threading.Event()
-        if paused:
-            self._paused.set()
+        self._paused = paused
+        self._steps = 0  # requested during this pause
+        self._ended = False
         self.start()
 
     def start(self) -> None:
         """Set the current position to 0."""
-        # Replace the tuple as a whole, because another thread may read or change it.
-        self._anchor = (time.monotonic(), 0.0, 0.0 if self.paused else self._rate)
+        self._move_to(0.0)
+
+    def _move_to(self, position_s: float) -> None:
+        """Set the current position, and let waits consider it."""
+        with self._changed:
+            self._position_s = position_s
+            self._since_s = time.monotonic()
+            self._changed.notify_all()
 
     @property
     def paused(self) -> bool:
         """Whether playing is paused."""
-        return self._paused.is_set()
+        return self._paused
 
     @property
     def position_s(self) -> float:
         """Current position [s]."""
-        anchor_s, position, rate = self._anchor
-        return position + (time.monotonic() - anchor_s) * rate
+        with self._changed:
+            passed_s = 0.0 if self._paused else time.monotonic() - self._since_s
+            return self._position_s + passed_s * self._rate
 
     def pause(self) -> None:
         """Stop at the current position."""
-        self._anchor = (time.monotonic(), self.position_s, 0.0)
-        self._paused.set()
+        with self._changed:
+            self._move_to(self.position_s)
+            self._paused = True
 
     def resume(self) -> None:
-        """Continue from the current position."""
-        self._anchor = (time.monotonic(), self.position_s, self._rate)
-        self._paused.clear()
+        """Continue from the current position; steps that were not made are dropped."""
+        with self._changed:
+            self._move_to(self.position_s)
+            self._paused = False
+            self._steps = 0
 
     def step(self) -> None:
         """End one wait during a pause."""
-        self._steps.release()
+        with self._changed:
+            self._steps += 1
+            self._changed.notify_all()
 
     def change(self, rate: float) -> None:
         """Continue from the current position at another speed."""
-        self._rate = rate
-        self._anchor = (time.monotonic(), self.position_s, 0.0 if self.paused else rate)
+        with self._changed:
+            self._move_to(self.position_s)
+            self._rate = rate
 
-    def wait(self, position_s: float, stop: threading.Event) -> bool:
-        """Wait until a position [s] is due; return whether `stop` ended the wait."""
-        while True:
-            if self.paused:
-                if self._steps.acquire(blocking=False):
-                    self._anchor = (time.monotonic(), position_s, 0.0)
-                    return stop.is_set()
-                if stop.wait(WAIT_S):
-                    return True
-                continue
-            anchor_s, position, rate = self._anchor
-            if rate == 0:  # resumed between the two lines above
-                continue
-            remaining_s = anchor_s + (position_s - position) / rate - time.monotonic()
-            if remaining_s <= 0:
-                return stop.is_set()
-            if stop.wait(min(remaining_s, WAIT_S)):
-                return True
+    def end(self) -> None:
+        """End all waits, also later ones."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def wait(self, position_s: float) -> bool:
+        """Wait until a position [s] is due; return whether end() ended the wait."""
+        with self._changed:
+            while not self._ended:
+                remaining_s = (position_s - self.position_s) / self._rate
+                if self._paused and self._steps:
+                    self._steps -= 1
+                    self._move_to(position_s)
+                    break
+                if not self._paused and remaining_s <= 0:
+                    break
+                self._changed.wait(LONGEST_S if self._paused else min(remaining_s, LONGEST_S))
+            return self._ended
 
 
 OBSERVATIONS = 'TargetObservations'
@@ -125,7 +140,7 @@ class PlayerParameters(PlayingOptions):
         minimum=0,
         maximum=100,
     )
-    strip_prefix: str = option('', 'prefix removed from recorded topics')
+    strip_prefix: str = option('', 'first parts of their names, removed from recorded topics')
     topics: tuple[str, ...] = option(('',), 'topics to play; empty: all')
 
 
@@ -200,10 +215,14 @@ class PlayerNode(ParameterNode):
             topics = topics_of(bag)
         except DataError as error:
             raise StartError(str(error)) from None
-        wanted_topics = [topic for topic in self._settings.topics if topic]
+        # Names in the bag: remapping applies to the names under which they are played.
+        wanted = resolved_names(self, filter(None, self._settings.topics), only_expand=True)
+        missing = sorted(wanted - set(topics))
+        if missing:
+            self.get_logger().warning(f'{bag}: there is no topic {", ".join(missing)}')
         outputs = {}
         for topic, info in topics.items():
-            if not wanted_topics or topic in wanted_topics:
+            if not wanted or topic in wanted:
                 output = self._create_output(topic, info)
                 if output is not None:
                     outputs[topic] = output
@@ -227,7 +246,8 @@ class PlayerNode(ParameterNode):
                 f'{topic} is not played: the type {info.type or "(none)"} is not installed'
             )
             return None
-        relative_name = topic.removeprefix(self._settings.strip_prefix).lstrip('/')
+        prefix = f'/{self._settings.strip_prefix.strip("/")}/'.replace('//', '/')
+        relative_name = f'{topic}/'.removeprefix(prefix).strip('/')
         try:
             return self.create_publisher(
                 message_type,
@@ -290,7 +310,7 @@ class PlayerNode(ParameterNode):
             if not count:
                 self._pace.start()
                 self._start_ns = start_ns
-            if self._pace.wait((message.log_time_ns - start_ns) * 1e-9, self._stopping):
+            if self._pace.wait((message.log_time_ns - start_ns) * 1e-9):
                 return
             output.publish(message.data)
             count += 1
@@ -304,6 +324,7 @@ class PlayerNode(ParameterNode):
     def stop(self) -> None:
         """Stop playing before the node is destroyed."""
         self._stopping.set()
+        self._pace.end()
         self._worker.join(2.0)
 
 

@@ -3,6 +3,7 @@
 
 """Counts, decisions and outputs of parts of the nodes, on plain objects without a graph."""
 
+import threading
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace as Fake
@@ -553,18 +554,28 @@ def test_pace_of_a_player_stops_goes_on_and_changes(monkeypatch):
     def wait(seconds):
         waited.append(seconds)
         now['s'] += seconds
-        return False
 
-    stop = Fake(wait=wait, is_set=lambda: False)
-    assert pace.wait(13.0, stop) is False and sum(waited) == pytest.approx(0.25)
-    assert max(waited) <= player_node.WAIT_S
-    assert pace.wait(2.0, Fake(is_set=lambda: True)) is True
-    assert pace.wait(99.0, Fake(wait=lambda _: True)) is True
-    paused = player_node.Pace(1.0, paused=True)
-    now['s'] += 9
-    assert paused.position_s == 0 and paused.wait(5.0, Fake(wait=lambda _: True)) is True
-    paused.step()
-    assert paused.wait(5.0, stop) is False and paused.position_s == 5
+    monkeypatch.setattr(pace._changed, 'wait', wait)
+    assert pace.wait(13.0) is False and waited == [pytest.approx(0.25)]
+    pace.end()
+    assert pace.wait(2.0) is True and pace.wait(99.0) is True
+
+
+def test_steps_are_made_in_their_pause_only():
+    pace = player_node.Pace(1.0, paused=True)
+    assert pace.position_s == 0
+    pace.step()
+    assert pace.wait(5.0) is False and pace.position_s == 5
+    pace.step()
+    pace.resume()  # before the step was made
+    assert pace.wait(5.0) is False
+    pace.pause()
+    played = []
+    waiting = threading.Thread(target=lambda: played.append(pace.wait(5.0)))
+    waiting.start()
+    pace.end()
+    waiting.join()
+    assert played == [True]
 
 
 def publisher(reliable=True, latched=True, depth=5):

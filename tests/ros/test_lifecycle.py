@@ -272,6 +272,34 @@ def test_cleanup_destroys_everything(ros, kind):
         node.destroy_node()
 
 
+@pytest.mark.parametrize('part', ['deactivate', 'reset'])
+def test_transition_that_cannot_be_undone_leaves_nothing(ros, monkeypatch, part):
+    node = CorrectionNode()
+    try:
+        before = len(list(node.publishers))
+        original = getattr(node, part)
+        failures = [RuntimeError('the middleware fails')]
+
+        def failing():
+            original()
+            if failures:
+                raise failures.pop()
+
+        monkeypatch.setattr(node, part, failing)
+        for transition in (node.trigger_configure, node.trigger_activate):
+            assert transition() == TransitionCallbackReturn.SUCCESS
+        results = [node.trigger_deactivate()]
+        if part == 'reset':
+            results.append(node.trigger_cleanup())
+        assert results[-1] == TransitionCallbackReturn.ERROR and not failures
+        assert len(list(node.publishers)) == before
+        for transition in (node.trigger_configure, node.trigger_activate):
+            assert transition() == TransitionCallbackReturn.SUCCESS
+        node.stop()
+    finally:
+        node.destroy_node()
+
+
 @pytest.mark.parametrize('node', NODES)
 def test_every_parameter_is_described(graph, node):
     client = graph.client

@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_graph import BAGS
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from fluoro_calib_ros.io.bags.reader import iterate_messages
+from fluoro_calib_ros.io.bags.writer import BagWriter
 
 TOPIC = '/a/target_observations'
 OFFSET_S = 0.5
@@ -66,3 +68,38 @@ def test_offset_behind_the_end_is_told(graph):
     )
     assert player.wait() == 1
     assert 'there is no message 1e+06 s after the first one' in player.log
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'topics'),
+    [
+        ({'strip_prefix': '/rig'}, ['/a/target_observations', '/rig_b/b/target_observations']),
+        (
+            {'topics': '[rig/a/target_observations, /rig_b/b/mistyped]'},
+            ['/rig/a/target_observations'],
+        ),
+    ],
+)
+def test_topics_and_prefixes_are_whole_names(graph, exposures, tmp_path, parameters, topics):
+    client = graph.client
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write_frame(exposures['a'][0], '/rig/a/target_observations')
+        bag.write_frame(exposures['b'][0], '/rig_b/b/target_observations')
+    player = graph.start(
+        'player_node',
+        {'bag': tmp_path / 'bag', 'start_paused': True, **parameters},
+        {'__ns': '/'},
+        wait=False,
+    )
+
+    def played():
+        found = client.get_publisher_names_and_types_by_node('player_node', '/')
+        return sorted(name for name, _ in found if name.endswith('observations'))
+
+    client.wait_until(
+        lambda: ('player_node', '/') in client.get_node_names_and_namespaces() and played(),
+        what='the player',
+    )
+    client.wait_until(lambda: played() == topics, what='its topics')
+    said = 'there is no topic /rig_b/b/mistyped' in player.log
+    assert said == ('topics' in parameters)

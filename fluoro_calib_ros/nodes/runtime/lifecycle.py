@@ -46,7 +46,8 @@ class ManagedNode(ParameterNode, LifecycleNode):
     """Lifecycle node that configures and activates itself, unless autostart is false.
 
     Subclasses override configure(), activate(), deactivate() and cleanup(). The last two must work
-    in every state. A transition that raises is undone and logged; rclpy itself would not log it.
+    in every state. A transition that raises is logged, which rclpy would not do, and undone; if
+    one of the last two raises, everything is cleaned up.
     """
 
     def __init__(self, name: str) -> None:
@@ -86,8 +87,8 @@ class ManagedNode(ParameterNode, LifecycleNode):
 
     def stop(self) -> None:
         """Deactivate and clean up before the node is destroyed."""
-        self.deactivate()
-        self.cleanup()
+        self._try(self.deactivate)
+        self._try(self.cleanup)
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
         """Destroy a publisher, possibly a lifecycle publisher."""
@@ -107,12 +108,17 @@ class ManagedNode(ParameterNode, LifecycleNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run deactivate()."""
-        self.deactivate()
-        return super().on_deactivate(state)
+        result = self._try(self.deactivate)
+        super().on_deactivate(state)
+        return result
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run cleanup()."""
-        self.cleanup()
+        return self._try(self.cleanup)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Clean up after a transition that could not be undone; the node is unconfigured then."""
+        self._try(self.cleanup)
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -121,8 +127,9 @@ class ManagedNode(ParameterNode, LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _try(
-        self, function: Callable[[], None], undo: Callable[[], None]
+        self, function: Callable[[], None], undo: Callable[[], None] | None = None
     ) -> TransitionCallbackReturn:
+        """Run a function; if it raises, log that and undo it, or report an error."""
         try:
             function()
         except Exception as error:
@@ -130,6 +137,8 @@ class ManagedNode(ParameterNode, LifecycleNode):
             self._fault = one_line(error) if is_user_error else Trace(traceback.format_exc())
             if not self._starting:  # otherwise the main loop logs it
                 self.get_logger().error(self._fault)
+            if undo is None:
+                return TransitionCallbackReturn.ERROR
             undo()
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS

@@ -63,9 +63,16 @@ def wait_for_readers(
         stop.wait(SETTLING_S)
 
 
-def resolved_names(node: Node, topics: Iterable[str]) -> set[str]:
-    """Return the full names of topics as a node uses them. Raises NameValidationException."""
-    return {node.resolve_topic_name(topic) for topic in topics if validate_topic_name(topic)}
+def resolved_names(node: Node, topics: Iterable[str], only_expand: bool = False) -> set[str]:
+    """Return the full names of topics as a node uses them; only_expand: without remapping.
+
+    Raises NameValidationException.
+    """
+    return {
+        node.resolve_topic_name(topic, only_expand=only_expand)
+        for topic in topics
+        if validate_topic_name(topic)
+    }
 
 
 class PublishedTopic(NamedTuple):

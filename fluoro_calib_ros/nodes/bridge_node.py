@@ -43,7 +43,7 @@ from .runtime.topics import (
 )
 
 HEAD_S = 5.0  # time limit for receiving the head of a request
-MAX_CLIENTS = 32  # simultaneous connections
+MAX_CLIENTS = 32  # simultaneous clients that are admitted
 CLIENT_ERRORS = (
     OSError,
     asyncio.TimeoutError,
@@ -105,7 +105,7 @@ class Gate:
         self._inner = inner
         self._admission = admission
         self._on_refused = on_refused
-        self._clients: set[asyncio.Task[None]] = set()
+        self._admitted = 0  # number of clients
         self._loop = asyncio.new_event_loop()
         self._server = self._loop.run_until_complete(asyncio.start_server(self._serve, host, port))
         self.port: int = self._server.sockets[0].getsockname()[1]
@@ -127,31 +127,35 @@ class Gate:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Check the request of a client, then forward data in both directions."""
-        task = asyncio.current_task()
-        assert task is not None
-        self._clients.add(task)
+        """Serve a client until it or the gate ends."""
         try:
             with suppress(*CLIENT_ERRORS):
                 await self._admit(reader, writer)
-        except asyncio.CancelledError:
+        except asyncio.CancelledError:  # by close(); asyncio would log it
             writer.transport.abort()  # close() would wait for a client that does not read
-            raise
         finally:
-            self._clients.discard(task)
             writer.close()
 
     async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        reason = 'there are too many clients'
-        head = b''
-        if len(self._clients) <= MAX_CLIENTS:
-            head = await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), HEAD_S)
-            reason = self._admission.refusal(head)
+        head = await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), HEAD_S)
+        reason = self._admission.refusal(head)
+        if not reason and self._admitted >= MAX_CLIENTS:
+            reason = 'there are too many clients'
         if reason:
             self._on_refused(str(writer.get_extra_info('peername')), reason)
             writer.write(REFUSED)
             await writer.drain()
             return
+        self._admitted += 1
+        try:
+            await self._forward(head, reader, writer)
+        finally:
+            self._admitted -= 1
+
+    async def _forward(
+        self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """Forward the request with this head, then data in both directions."""
         inner_reader, inner_writer = await asyncio.open_connection(*self._inner)
         inner_writer.write(b'GET / HTTP/1.1' + head[head.index(b'\r\n') :])
         try:

@@ -32,14 +32,13 @@ from ..jobs.result_folder import save_calibrations, save_healed_version
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import in_worker_process
 from .calibration_services import Job
-from .calibration_settings import NOT_ACTIVE, check_folders
+from .calibration_settings import MAX_HEAL_S, NOT_ACTIVE, check_folders
 from .exposure_input import NodeParts
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.self_calibration import fill_healing
 from .runtime.services import in_thread, telling_service, wake, within
 
 MAX_FRAMES = 20_000  # maximum number collected per fluoroscope, whatever its rate
-MAX_SECONDS = 60.0  # maximum collection time: changes show within a few seconds
 PAUSE_S = 1.0  # longest interval between frames that counts as time in which markers are seen
 CHANGED = 'the rig in use has changed meanwhile, heal it again'
 
@@ -163,10 +162,8 @@ class Healing(Job):
     async def _work(self, goal: Any, result: Any) -> None:
         """Collect frames, diagnose what has changed, and keep the outcome."""
         seconds = goal.request.seconds or self._rig.settings().node.heal_time
-        if not 0 < seconds <= MAX_SECONDS:
-            raise DataError(
-                f'seconds must be above 0 and at most {MAX_SECONDS:g}, not {seconds:g}'
-            )
+        if not 0 < seconds <= MAX_HEAL_S:
+            raise DataError(f'seconds must be above 0 and at most {MAX_HEAL_S:g}, not {seconds:g}')
         rig = self._present_rig()
         self._healed = None
 

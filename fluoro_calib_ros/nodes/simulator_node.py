@@ -48,6 +48,7 @@ from .runtime.topics import (
 )
 
 SCENES = ('phantom', 'standing', 'markers', 'grid')
+GRID_FRAMES = 300  # of the grid, which are repeated: 45 MB
 LOOP_S = 10.0  # duration of a precomputed scene, which is repeated
 
 
@@ -159,8 +160,7 @@ class SimulatorNode(ParameterNode):
             self._moving_mm = tracking.points_mm
             frames = tracking.frames
         elif parameters.scene == 'grid':
-            count = max(1, round(LOOP_S * parameters.rate))
-            frames = simulate_grid(self._rig, count, parameters.seed, parameters.noise)
+            frames = simulate_grid(self._rig, GRID_FRAMES, parameters.seed, parameters.noise)
         else:
             return {}
         return {

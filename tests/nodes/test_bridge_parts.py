@@ -5,10 +5,11 @@
 
 import socket
 import threading
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import pytest
 
+from fluoro_calib_ros.nodes import bridge_node
 from fluoro_calib_ros.nodes.bridge_node import Admission, Gate
 
 HOST = '127.0.0.1'
@@ -55,8 +56,32 @@ def received(connection):
     return count
 
 
+def test_only_admitted_clients_count(inner, monkeypatch):
+    """Connections without a token do not keep the right one out."""
+    monkeypatch.setattr(bridge_node, 'MAX_CLIENTS', 1)
+    address, answers = inner
+    answers.append(b'hello')
+    refused = []
+    gate = Gate(HOST, 0, address, Admission('t', ()), lambda _, reason: refused.append(reason))
+    with ExitStack() as clients:
+
+        def connect():
+            address = HOST, gate.port
+            return clients.enter_context(socket.create_connection(address, 30))
+
+        for _ in range(5):
+            connect()
+        admitted = connect()
+        admitted.sendall(REQUEST)
+        assert admitted.recv(5) == b'hello' and not refused
+        second = connect()
+        second.sendall(REQUEST)
+        assert second.recv(12) == b'HTTP/1.1 403' and refused == ['there are too many clients']
+        gate.close()
+
+
 @pytest.mark.parametrize('answer', [b'hello', MUCH], ids=['reads', 'does not read'])
-def test_closed_gate_neither_listens_nor_keeps_clients(inner, answer):
+def test_closed_gate_neither_listens_nor_keeps_clients(inner, answer, caplog):
     address, answers = inner
     answers.append(answer)
     gate = Gate(HOST, 0, address, Admission('t', ()), on_refused=lambda *_: None)
@@ -71,3 +96,4 @@ def test_closed_gate_neither_listens_nor_keeps_clients(inner, answer):
         assert not received(silent)
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection((HOST, gate.port), 30)
+    assert not caplog.records  # asyncio logs the errors of tasks

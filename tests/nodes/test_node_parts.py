@@ -21,6 +21,7 @@ from sensor_msgs.msg import Image
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import ImageCorrector
+from fluoro_calib_ros.limits import CollectLimits
 from fluoro_calib_ros.nodes import calibration_input, calibration_services
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
 from fluoro_calib_ros.nodes.calibration_services import OrientationService
@@ -289,7 +290,9 @@ def orientation_service(output):
     rig = SimpleNamespace(
         names=('a', 'b'),
         required_phantom=lambda: rigs.rig().phantom,
-        settings=lambda: SimpleNamespace(node=SimpleNamespace(rig_frame='rig')),
+        settings=lambda: SimpleNamespace(
+            node=SimpleNamespace(rig_frame='rig'), limits=CollectLimits(max_exposures=500)
+        ),
     )
     parts = SimpleNamespace(
         node=node, rig=rig, exposures=None, output=output, files=None, requests=Requests()
@@ -319,6 +322,13 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
     service.add({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
     with pytest.raises(DataError, match='the calibrations have changed meanwhile'):
         capture.send(None)
+
+
+def test_orientation_from_too_many_frames_is_refused():
+    service, request = orientation_service(SimpleNamespace(calibrations={}))
+    request.frames = 4_000_000_000
+    with pytest.raises(DataError, match='frames must be at most 500'):
+        service._orient(request).send(None)
 
 
 def test_a_rig_that_is_not_calibrated_is_refused_before_the_capture():

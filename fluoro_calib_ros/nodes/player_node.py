@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -19,6 +20,14 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from ..errors import DataError
+from ..io.bags.mcap_file import (
+    ChannelInfo,
+    channels_of_bag,
+    channels_of_file,
+    is_foreign,
+    storage_files,
+)
+from ..io.bags.metadata import known_definition
 from ..io.bags.reader import TopicInfo, iterate_messages, topics_of
 from ..io.bags.recording import PlayingOptions
 from ..options import option
@@ -213,6 +222,7 @@ class PlayerNode(ParameterNode):
         """Return the publishers of the topics to play. Raises StartError."""
         try:
             topics = topics_of(bag)
+            channels = _channels_of(bag)
         except DataError as error:
             raise StartError(str(error)) from None
         # Names in the bag: remapping applies to the names under which they are played.
@@ -222,7 +232,7 @@ class PlayerNode(ParameterNode):
             self.get_logger().warning(f'{bag}: there is no topic {", ".join(missing)}')
         outputs = {}
         for topic, info in topics.items():
-            if not wanted or topic in wanted:
+            if (not wanted or topic in wanted) and self._is_playable(channels[topic]):
                 output = self._create_output(topic, info)
                 if output is not None:
                     outputs[topic] = output
@@ -234,6 +244,22 @@ class PlayerNode(ParameterNode):
         if not any(topics[topic].count for topic in outputs):
             raise StartError(f'{bag}: there are no messages on {", ".join(outputs)}')
         return outputs
+
+    def _is_playable(self, info: ChannelInfo) -> bool:
+        """Return whether messages are in CDR, and warn if they, or their type, are others."""
+        topic = info.channel.topic
+        encoding = info.channel.message_encoding
+        if encoding != 'cdr':
+            self.get_logger().warning(f'{topic} is not played: it is encoded as {encoding!r}')
+            return False
+        recorded = info.definition.type_hash
+        with suppress(DataError):  # a type of another package
+            if recorded and recorded != known_definition(info.msg_type).type_hash:
+                self.get_logger().warning(
+                    f'{topic} was recorded with another definition of {info.msg_type}: only '
+                    'nodes that know that definition can read it'
+                )
+        return True
 
     def _create_output(self, topic: str, info: TopicInfo) -> Publisher | None:
         """Return the publisher of a topic, with a relative name so that it can be remapped.
@@ -326,6 +352,15 @@ class PlayerNode(ParameterNode):
         self._stopping.set()
         self._pace.end()
         self._worker.join(2.0)
+
+
+def _channels_of(bag: str) -> dict[str, ChannelInfo]:
+    """Return a channel of each topic of a bag. Raises DataError."""
+    if is_foreign(bag):
+        channels = channels_of_bag(bag)
+    else:
+        channels = [info for path in storage_files(bag) for info in channels_of_file(path)]
+    return {info.channel.topic: info for info in channels}
 
 
 def is_latched(info: TopicInfo) -> bool:

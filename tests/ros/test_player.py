@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import pytest
+from mcap.writer import Writer
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_graph import BAGS
 from rosgraph_msgs.msg import Clock
@@ -103,3 +104,24 @@ def test_topics_and_prefixes_are_whole_names(graph, exposures, tmp_path, paramet
     client.wait_until(lambda: played() == topics, what='its topics')
     said = 'there is no topic /rig_b/b/mistyped' in player.log
     assert said == ('topics' in parameters)
+
+
+def test_messages_of_another_definition_or_encoding_are_not_played_silently(graph, tmp_path):
+    path = tmp_path / 'bag.mcap'
+    with open(path, 'wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'test')
+        text = writer.register_schema('std_msgs/msg/String', 'ros2msg', b'uint32 number')
+        other = {'topic_type_hash': f'RIHS01_{"0" * 64}'}
+        channels = [
+            writer.register_channel('/other', 'cdr', text, other),
+            writer.register_channel('/json', 'json', text, {}),
+        ]
+        for channel in channels:
+            writer.add_message(channel, 1, b'\0\1\0\0\5\0\0\0', 1)
+        writer.finish()
+    player = graph.start('player_node', {'bag': path, 'wait_for_readers': 0}, wait=False)
+    assert player.wait() == 0
+    assert '/other was recorded with another definition of std_msgs/msg/String' in player.log
+    assert "/json is not played: it is encoded as 'json'" in player.log
+    assert '1 messages played' in player.log

@@ -79,19 +79,16 @@ class DriftMonitor:
         self._logger = logger
         self.reset()
 
-    def use(self, parameters: DriftParameters) -> bool:
-        """Use new parameters; return whether the watches must be created anew."""
-        previous = self._parameters
+    def use(self, parameters: DriftParameters, options: DriftOptions) -> bool:
+        """Use new parameters and options; return whether the watches must be created anew."""
+        previous = self._parameters, self._options
         self._parameters = parameters
+        self._options = options
         self._bodies = parameters.rigid_bodies()
         actions = {
             name: getattr(parameters, name) for name in ('collect_on_drift', 'heal_on_drift')
         }
-        return replace(previous, **actions) != parameters
-
-    def use_options(self, options: DriftOptions) -> None:
-        """Use new options for watches created from now on."""
-        self._options = options
+        return (replace(previous[0], **actions), previous[1]) != (parameters, options)
 
     def reset(self) -> None:
         """Discard image sizes, exposures and alarms."""

@@ -47,8 +47,11 @@ from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
     CalibratedParameters,
-    ParameterGroup,
+    declare_groups,
     declare_read_limits,
+    follow_groups,
+    group,
+    groups_of,
 )
 from .runtime.topics import latched_qos, observations_qos
 
@@ -85,31 +88,37 @@ class ReconstructionParameters(CalibratedParameters):
     min_fluoroscopes = 2
 
 
-_NODE = ParameterGroup(
-    ReconstructionParameters, settable=('reject', 'ellipsoid_sigmas', 'ellipsoid_rate')
-)
-_PAIRING = ParameterGroup(
-    PairingOptions,
-    {
-        'pair_by': 'pair_by',
-        'tolerance_s': 'pair_tolerance',
-        'waiting': 'waiting',
-        'patience': 'patience',
-    },
-    settable=('pair_tolerance', 'waiting', 'patience'),
-)
-_DRIFT = ParameterGroup(
-    DriftParameters,
-    settable=('drift_watch', 'drift_rate', 'clusters', 'collect_on_drift', 'heal_on_drift'),
-)
-_DRIFT_OPTIONS = ParameterGroup(
-    DriftOptions,
-    {'warn_interval_h': 'drift_warn_interval', 'error_interval_h': 'drift_error_interval'},
-    settable=('drift_warn_interval', 'drift_error_interval'),
-)
-_BODIES = ParameterGroup(BodyParameters)
-_LIMITS = ParameterGroup(StreamLimits)
-PARAMETERS = (_NODE, _PAIRING, _BODIES, _DRIFT, _DRIFT_OPTIONS, _LIMITS, READ_LIMITS)
+@dataclass(frozen=True)
+class ReconstructionSettings:
+    """Parameter values by group."""
+
+    node: ReconstructionParameters = group(
+        ReconstructionParameters, settable=('reject', 'ellipsoid_sigmas', 'ellipsoid_rate')
+    )
+    pairing: PairingOptions = group(
+        PairingOptions,
+        {
+            'pair_by': 'pair_by',
+            'tolerance_s': 'pair_tolerance',
+            'waiting': 'waiting',
+            'patience': 'patience',
+        },
+        settable=('pair_tolerance', 'waiting', 'patience'),
+    )
+    bodies: BodyParameters = group(BodyParameters)
+    drift: DriftParameters = group(
+        DriftParameters,
+        settable=('drift_watch', 'drift_rate', 'clusters', 'collect_on_drift', 'heal_on_drift'),
+    )
+    drift_limits: DriftOptions = group(
+        DriftOptions,
+        {'warn_interval_h': 'drift_warn_interval', 'error_interval_h': 'drift_error_interval'},
+        settable=('drift_warn_interval', 'drift_error_interval'),
+    )
+    limits: StreamLimits = group(StreamLimits)
+
+
+PARAMETERS = (*groups_of(ReconstructionSettings).values(), READ_LIMITS)
 
 
 @dataclass(frozen=True)
@@ -128,20 +137,14 @@ class ReconstructionNode(StreamNode):
     def __init__(self) -> None:
         super().__init__('reconstruction_node')
         declare_read_limits(self)
-        self._settings = _NODE.declare(self)
-        self._limits = _LIMITS.declare(self)
-        self._pairing = _PAIRING.declare(self)
-        self._body_parameters = _BODIES.declare(self)
-        self.autostart = self._settings.autostart
-        self._names = self._settings.fluoroscopes
+        self._settings = settings = declare_groups(self, ReconstructionSettings)
+        self.autostart = settings.node.autostart
+        self._names = settings.node.fluoroscopes
         self._drift = DriftMonitor(
-            self._names, _DRIFT.declare(self), _DRIFT_OPTIONS.declare(self), self.get_logger()
+            self._names, settings.drift, settings.drift_limits, self.get_logger()
         )
         self.reset()
-        _NODE.follow(self, self._use_settings)
-        _PAIRING.follow(self, self._use_pairing)
-        _DRIFT.follow(self, self._use_drift_parameters)
-        _DRIFT_OPTIONS.follow(self, self._use_drift_options)
+        follow_groups(self, lambda: self._settings, self._use)
 
     def reset(self) -> None:
         """Discard the orientations and reset all counters."""
@@ -150,12 +153,12 @@ class ReconstructionNode(StreamNode):
         self._streams = {name: Stream(name, self._refusals) for name in self._names}
         self._rigs = RigInput(
             self._names,
-            self._settings.reject,
+            self._settings.node.reject,
             self._drift,
             refusals=self._refusals,
             logger=self.get_logger(),
         )
-        self._pairer = exposure_pairer(self._names, self._pairing)
+        self._pairer = exposure_pairer(self._names, self._settings.pairing)
         self._points = PointsCounter()
         self._misses = RecentMisses()
         self._follower: BodyFollower | None = None
@@ -166,21 +169,13 @@ class ReconstructionNode(StreamNode):
 
     # -- parameters
 
-    def _use_settings(self, settings: ReconstructionParameters) -> None:
+    def _use(self, settings: ReconstructionSettings) -> None:
+        """Use new settings from now on."""
         self._settings = settings
-        self._rigs.use_reject(settings.reject)
-
-    def _use_pairing(self, pairing: PairingOptions) -> None:
-        self._pairing = pairing
-        self._pairer.use(pairing)
-
-    def _use_drift_parameters(self, parameters: DriftParameters) -> None:
-        if self._drift.use(parameters):
+        self._rigs.use_reject(settings.node.reject)
+        self._pairer.use(settings.pairing)
+        if self._drift.use(settings.drift, settings.drift_limits):
             self._rigs.renew_watches()
-
-    def _use_drift_options(self, options: DriftOptions) -> None:
-        self._drift.use_options(options)
-        self._rigs.renew_watches()
 
     # -- lifecycle
 
@@ -199,18 +194,20 @@ class ReconstructionNode(StreamNode):
         self._transforms = self.create_publisher(TFMessage, '/tf_static', latched_qos())
         self.own(self._transforms, self.destroy_publisher, self._transforms)
         self._create_inputs()
-        settings = self._settings
+        settings = self._settings.node
         saved = self._rigs.saved(settings.orientation_file, settings.calibration_directory)
         if saved is not None:
             self._on_orientation(saved)
 
     def _create_bodies(self) -> None:
         """Read the files of bodies and joints, and create their outputs. Raises DataError."""
-        bodies, joints = read_body_files(self._body_parameters)
+        settings = self._settings
+        bodies, joints = read_body_files(settings.bodies)
         if bodies:
-            self._follower = BodyFollower(bodies, joints, self._body_parameters.body_lag)
+            self._follower = BodyFollower(bodies, joints, settings.bodies.body_lag)
             names = [body.name for body in bodies]
-            self._bodies_output = BodiesOutput(self, names, bool(joints), self._settings.rig_frame)
+            rig_frame = settings.node.rig_frame
+            self._bodies_output = BodiesOutput(self, names, bool(joints), rig_frame)
             self._retractions.bodies = self._bodies_output.retractions
 
     def _create_inputs(self) -> None:
@@ -231,14 +228,15 @@ class ReconstructionNode(StreamNode):
     def create_readers(self) -> None:
         """Receive the corrected observations of all fluoroscopes in one thread."""
         reader = self.create_reader(stream_faults(self._streams, self.fail))
+        limits = self._settings.limits
         for name in self._names:
             reader.subscribe(
                 CorrectedObservations,
                 f'{name}/{VIEWS}',
                 partial(self._on_view, name),
                 observations_qos(),
-                decode=with_limit(decode_corrected_observations, self._limits.max_points),
-                max_bytes=self._limits.max_bytes,
+                decode=with_limit(decode_corrected_observations, limits.max_points),
+                max_bytes=limits.max_bytes,
             )
 
     def deactivate(self) -> None:
@@ -268,7 +266,9 @@ class ReconstructionNode(StreamNode):
 
     def _publish_transforms(self, message: RigOrientation) -> None:
         self._transforms.publish(
-            transforms_of_orientation(message, self._settings.rig_frame, self._rigs.calibrated)
+            transforms_of_orientation(
+                message, self._settings.node.rig_frame, self._rigs.calibrated
+            )
         )
 
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
@@ -319,7 +319,7 @@ class ReconstructionNode(StreamNode):
             target_id=intersected.target_id,
             points=intersected.points,
         )
-        settings = self._settings
+        settings = self._settings.node
         self._output.publish(content, settings.ellipsoid_sigmas, settings.ellipsoid_rate)
         self._retractions.note({n: view.stamp_ns for n, view in exposure.items()}, content)
         self._reconstructed += 1

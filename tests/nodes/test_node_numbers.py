@@ -25,6 +25,7 @@ from rclpy.type_hash import TypeHash
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
+from fluoro_calib_ros.checks.drift_charts import DriftOptions
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.nodes import (
@@ -34,6 +35,7 @@ from fluoro_calib_ros.nodes import (
 )
 from fluoro_calib_ros.nodes.angle_input import AngleInput, beyond_text
 from fluoro_calib_ros.nodes.bridge_node import Admission
+from fluoro_calib_ros.nodes.calibration_node import CalibrationNode
 from fluoro_calib_ros.nodes.calibration_services import _Capture
 from fluoro_calib_ros.nodes.calibration_settings import check_folders
 from fluoro_calib_ros.nodes.dashboard import state as session_state
@@ -287,6 +289,20 @@ def angles():
     return made, log
 
 
+def test_parts_that_need_the_angle_of_a_frame_count_it_once():
+    made, _ = angles()
+    part = Fake(add=lambda name, frame, angle: angle())
+    node = Fake(
+        _settings=Fake(angles=AngleOptions('a:carm')),
+        _angles=made,
+        _exposures=part,
+        _healing=part,
+        _learning=part,
+    )
+    CalibrationNode._on_frame(node, 'a', Fake(sec=99, nanosec=0), {})
+    assert made.values('a')['frames without angle'] == 1
+
+
 def test_angles_are_given_counted_and_doubted_once():
     made, log = angles()
     assert made.of_frame('a', 1005 * 10**6, needed=True) == pytest.approx(0.1)
@@ -427,11 +443,15 @@ def test_window_has_the_frames_of_a_time_in_which_markers_are_seen(monkeypatch):
 
 
 def test_parameters_that_only_ask_make_no_new_watches():
-    monitor = DriftMonitor('ab', DriftParameters(), None, Log())
-    assert not monitor.use(DriftParameters(collect_on_drift=True, heal_on_drift=True))
-    assert monitor.use(DriftParameters(collect_on_drift=True, heal_on_drift=True, drift_rate=5.0))
+    options = DriftOptions()
+    monitor = DriftMonitor('ab', DriftParameters(), options, Log())
+    assert not monitor.use(DriftParameters(collect_on_drift=True, heal_on_drift=True), options)
+    changed = DriftParameters(collect_on_drift=True, heal_on_drift=True, drift_rate=5.0)
+    assert monitor.use(changed, options)
+    later = DriftOptions(warn_interval_h=1.0)
+    assert monitor.use(changed, later) and not monitor.use(changed, later)
     assert monitor.make_watch(None) is None  # image sizes are unknown
-    assert monitor.use(DriftParameters(drift_watch=False))
+    assert monitor.use(DriftParameters(drift_watch=False), options)
     monitor.newest = None, 'o', 7
     assert monitor.publish_state() == []
 

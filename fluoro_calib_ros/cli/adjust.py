@@ -18,10 +18,9 @@ from .arguments import (
     add_out,
     add_phantom,
     add_source,
-    bag_selection,
-    file_settings,
+    read_calibrated_exposures,
 )
-from .output import print_findings, print_notes, print_result, print_unpaired, styled_verdict
+from .output import print_findings, print_result, styled_verdict
 
 CONTRADICTIONS = (Kind.CORRECTED_ALREADY, Kind.POOR_CALIBRATION_FIT)
 HOLDS = 'The calibration holds for these exposures; its interior orientation was fixed.'
@@ -57,29 +56,15 @@ def run(arguments: argparse.Namespace) -> bool:
 
     Raises DataError.
     """
-    from ..io.calibration import disagreements
-    from ..io.csv_table import read_names
     from ..io.folder import check_output_folder
     from ..jobs.calibration import adjust
     from ..jobs.result_folder import RESULT_FOLDER, save_result, written_document
-    from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations
+    from ..jobs.sources import select_calibrations
     from ..report.tables import summary_table
 
     inputs = (arguments.source, arguments.phantom, arguments.calibration)
     check_output_folder(arguments.out, RESULT_FOLDER, inputs)
-    calibrations = read_calibrations(arguments.calibration)
-    print_notes(disagreements(arguments.calibration, calibrations))
-    stored_names = read_names(arguments.calibration)
-    survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
-    recording = read_source(
-        arguments.source,
-        image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        settings=file_settings(arguments, names=stored_names.merged(survey.names)),
-        selection=bag_selection(arguments),
-    )
-    print_notes((*survey.notes, *recording.notes))
-    print_unpaired(arguments.source, recording.unpaired)
+    survey, recording, calibrations = read_calibrated_exposures(arguments)
     frames = recording.frames
     calibrations = select_calibrations(calibrations, frames, arguments.calibration)
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)

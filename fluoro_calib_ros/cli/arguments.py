@@ -15,16 +15,18 @@ from ..errors import ErrorsAt
 from ..io.rig_file import NAME
 from ..limits import ReadLimits
 from ..options import Option, declared
+from .output import print_notes, print_unpaired
 from .rig import JointOfRig
 
 if TYPE_CHECKING:
     from ..bodies.body import Body
     from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..exposures.angles import AngleOptions
+    from ..exposures.names import Names
     from ..io.access import PathLike
     from ..io.formats.content import FileSettings
     from ..jobs.scheduling import Cluster
-    from ..jobs.sources import BagSelection, Recording
+    from ..jobs.sources import BagSelection, Recording, Survey
     from ..photogrammetry.rig_orientation import RigOrientation
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
@@ -178,6 +180,47 @@ def read_oriented_source(
     with ErrorsAt(path):
         check_orientation(orientation.subset(names) if names else orientation, calibrations)
     return recording, calibrations, orientation
+
+
+def read_exposures(arguments: argparse.Namespace, names: Names) -> Recording:
+    """Read the source of a command with --collect; names: the known ones. Raises DataError."""
+    from ..jobs.sources import read_source
+
+    return read_source(
+        arguments.source,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+        collect=arguments.collect,
+        settings=file_settings(arguments, names=names),
+        selection=bag_selection(arguments),
+    )
+
+
+def read_calibrated_exposures(
+    arguments: argparse.Namespace,
+) -> tuple[Survey, Recording, dict[str, FluoroscopeCalibration]]:
+    """Read a phantom, exposures of it and calibrations, print notes. Raises DataError."""
+    from ..io.csv_table import read_names
+    from ..jobs.sources import read_calibrated_source, read_survey
+
+    stored_names = read_names(arguments.calibration)
+    survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
+    recording, calibrations = read_calibrated_source(
+        arguments.source,
+        arguments.calibration,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+        settings=file_settings(arguments, names=survey.names),
+        selection=bag_selection(arguments),
+    )
+    print_inputs(arguments.source, survey, recording)
+    return survey, recording, calibrations
+
+
+def print_inputs(source: Path, survey: Survey | None, recording: Recording) -> None:
+    """Print the notes on a phantom and a recording, and its frames without partner."""
+    print_notes((*(() if survey is None else survey.notes), *recording.notes))
+    print_unpaired(source, recording.unpaired)
 
 
 def add_out(parser: Parser, text: str, metavar: str = 'DIR') -> None:

@@ -24,20 +24,19 @@ from .arguments import (
     add_scheduler,
     add_source,
     angle_options,
-    bag_selection,
     cluster_of,
     file_settings,
     options_of,
+    print_inputs,
+    read_exposures,
 )
 from .output import (
     ProgressBar,
     print_findings,
     print_note,
-    print_notes,
     print_result,
     print_round,
     print_step,
-    print_unpaired,
     styled_verdict,
 )
 
@@ -224,8 +223,7 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
     moving = bool(known_orientations) and has_exposures(arguments.phantom)
     survey = None if moving else read_survey(arguments.phantom, file_settings(arguments))
     recording = _recording(arguments, survey)
-    print_notes((*(() if survey is None else survey.notes), *recording.notes))
-    print_unpaired(arguments.source, recording.unpaired)
+    print_inputs(arguments.source, survey, recording)
     if survey is None:
         # Its targets have an id of their own in every exposure.
         frames, phantom = read_moving_points(arguments.phantom).as_phantom(recording.frames)
@@ -265,19 +263,11 @@ def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
     """Read or extract the observations. Raises DataError."""
     from ..exposures.names import Names
     from ..jobs.image_sources import contains_images
-    from ..jobs.sources import read_source, with_decisions
+    from ..jobs.sources import with_decisions
 
     if contains_images(arguments.source):
         return with_decisions(_extracted(arguments, survey), arguments.decisions)
-    names = Names() if survey is None else survey.names
-    return read_source(
-        arguments.source,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        collect=arguments.collect,
-        settings=file_settings(arguments, names=names),
-        selection=bag_selection(arguments),
-    )
+    return read_exposures(arguments, Names() if survey is None else survey.names)
 
 
 def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:

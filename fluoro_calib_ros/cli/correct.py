@@ -114,12 +114,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _correct_points(arguments: argparse.Namespace, calibrations: Calibrations) -> None:
     from ..io.observations import correct_points, write_points
-    from ..jobs.sources import read_point_table
+    from ..jobs.sources import calibrated_settings, read_point_table
 
-    size = next(iter(calibrations.values())).image_size
     names = () if arguments.fluoroscope is None else (arguments.fluoroscope,)
-    settings = file_settings(arguments, image_size=size, fluoroscopes=names)
-    points, notes = read_point_table(arguments.source, arguments.calibration, settings)
+    settings = file_settings(arguments, fluoroscopes=names)
+    settings = calibrated_settings(settings, arguments.calibration, calibrations)
+    points, notes = read_point_table(arguments.source, settings)
     print_notes(notes)
     corrected = correct_points(points, calibrations, angle_of(arguments))
     write_points(arguments.out, points, corrected)

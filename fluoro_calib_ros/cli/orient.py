@@ -14,10 +14,9 @@ from .arguments import (
     add_calibration,
     add_phantom,
     add_source,
-    bag_selection,
-    file_settings,
+    read_calibrated_exposures,
 )
-from .output import print_notes, print_result, print_unpaired
+from .output import print_notes, print_result
 
 NAME = 'orient'
 HELP = 'Orient the rig from a capture of the phantom, which stands still in the rig frame.'
@@ -65,25 +64,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Orient the rig and write DIR/rig_orientation.npz. Raises DataError."""
     from ..io.calibration import save_orientation
-    from ..io.csv_table import read_names
     from ..io.result_document import orientation_document
     from ..jobs.orientation import orient
     from ..jobs.result_folder import belongs_to, saved_orientation
-    from ..jobs.sources import read_calibrated_source, read_survey
     from ..report.tables import orientation_text
 
-    stored_names = read_names(arguments.calibration)
-    survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
-    recording, calibrations = read_calibrated_source(
-        arguments.source,
-        arguments.calibration,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        settings=file_settings(arguments, names=survey.names),
-        selection=bag_selection(arguments),
-    )
-    print_notes((*survey.notes, *recording.notes))
-    print_unpaired(arguments.source, recording.unpaired)
+    survey, recording, calibrations = read_calibrated_exposures(arguments)
     frames = recording.frames
     if arguments.exposures is not None:
         frames = {

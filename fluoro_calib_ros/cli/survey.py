@@ -17,11 +17,12 @@ from .arguments import (
     add_phantom,
     add_principal_distance,
     add_source,
-    bag_selection,
     file_settings,
     options_of,
+    print_inputs,
+    read_exposures,
 )
-from .output import print_findings, print_notes, print_result, print_round, print_unpaired
+from .output import print_findings, print_result, print_round
 
 if TYPE_CHECKING:
     from ..estimation.survey import MeasuredDistance
@@ -89,20 +90,12 @@ def run(arguments: argparse.Namespace) -> None:
     """Survey a phantom and write it. Raises DataError, also for the verdict 'fail'."""
     from ..estimation.options import CalibrationOptions
     from ..io.phantom import write_phantom
-    from ..jobs.sources import read_source, read_survey
+    from ..jobs.sources import read_survey
     from ..jobs.survey import SurveyRequest, survey
 
     initial = read_survey(arguments.phantom, file_settings(arguments))
-    recording = read_source(
-        arguments.source,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        collect=arguments.collect,
-        settings=file_settings(arguments, names=initial.names),
-        selection=bag_selection(arguments),
-    )
-    print_notes((*initial.notes, *recording.notes))
-    print_unpaired(arguments.source, recording.unpaired)
+    recording = read_exposures(arguments, initial.names)
+    print_inputs(arguments.source, initial, recording)
     request = SurveyRequest(
         recording.frames,
         initial.phantom,

@@ -73,15 +73,16 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..io.calibration import edited, exchanged, read_result, used_exposures
     from ..io.result_document import write_validation
     from ..jobs.result_folder import saved_orientation
-    from ..jobs.sources import read_calibrations
+    from ..jobs.sources import read_calibrations, select_calibrations
     from ..report.tables import verdict_text
 
-    calibrations = read_calibrations(arguments.directory, arguments.fluoroscopes)
+    rig = read_calibrations(arguments.directory)
+    calibrations = select_calibrations(rig, arguments.fluoroscopes or rig, arguments.directory)
     document = read_result(arguments.directory)
     finding = exchanged(arguments.directory, document, calibrations)
     if finding is not None:
         raise DataError(finding)
-    request = _request(arguments, calibrations)
+    request = _request(arguments, rig, calibrations)
     request = request.with_exposures(used_exposures(document, request.frames))
     orientation = saved_orientation(arguments.directory)
     is_captured = orientation is not None and orientation.source == 'capture'
@@ -105,33 +106,34 @@ def run(arguments: argparse.Namespace) -> bool:
     return passed
 
 
-def _request(arguments: argparse.Namespace, calibrations: Calibrations) -> CalibrationRequest:
-    """Read the inputs of the calibrations, from the folder or the given files."""
+def _request(
+    arguments: argparse.Namespace, rig: Calibrations, calibrations: Calibrations
+) -> CalibrationRequest:
+    """Read the inputs of some calibrations of a rig, from the folder or the given files."""
     from ..estimation.options import CalibrationRequest
     from ..io.calibration import PHANTOM
     from ..io.calibration_request import read_request
-    from ..io.csv_table import read_names
     from ..io.phantom import read_phantom
     from ..jobs.calibration import without_unusable
-    from ..jobs.sources import BagSelection, read_source, read_survey
+    from ..jobs.sources import BagSelection, calibrated_settings, read_source, read_survey
 
     frames: Frames | None = None
     phantom = None
-    stored_names = read_names(arguments.directory)
+    settings = calibrated_settings(file_settings(arguments), arguments.directory, rig)
     if arguments.source is not None:
         recording = read_source(
             arguments.source,
-            image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
+            image_size=arguments.image_size,
             fluoroscopes=arguments.fluoroscopes,
             collect=arguments.collect,
-            settings=file_settings(arguments, names=stored_names),
+            settings=settings,
             selection=BagSelection(angles=angle_options(arguments)),
         )
         print_notes(recording.notes)
         print_unpaired(arguments.source, recording.unpaired)
         frames = recording.frames
     if arguments.phantom is not None:
-        survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
+        survey = read_survey(arguments.phantom, settings)
         print_notes(survey.notes)
         phantom = survey.phantom
     saved_phantom = arguments.directory / PHANTOM

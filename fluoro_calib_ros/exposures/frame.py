@@ -176,8 +176,8 @@ def angles_of(frames: Iterable[Frame]) -> NDArray[np.float64]:
     return np.array([np.nan if f.angle is None else f.angle for f in frames], dtype=float)
 
 
-def points_on_image(uv: ArrayLike, image_size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return (n,) whether pixels (n, 2) lie on the image.
+def points_on_image(uv: ArrayLike, image_size: ArrayLike) -> NDArray[np.bool_]:
+    """Return (n,) whether pixels (n, 2) lie on the image, or each on its own (n, 2).
 
     Pixel centres are at integers; NaN is off the image.
     """

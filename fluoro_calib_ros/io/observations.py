@@ -11,7 +11,7 @@ The first three columns may contain names instead of ids.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -83,14 +83,19 @@ def read_observations_csv(
     Raises DataError that names the row for text that is not a number, a point off the image, and a
     target that occurs twice in a frame.
     """
-    return _read(path, image_size, _Columns(None))[0]
+    if image_size is None:
+        raise DataError(
+            f'{path}: a CSV file does not contain the image size, --image-size WxH is needed'
+        )
+    return _read(path, lambda _: image_size, _Columns(None))[0]
 
 
 def read_named_observations(
-    path: PathLike, image_size: tuple[int, int] | None, known: Names
+    path: PathLike, image_size: Callable[[str], tuple[int, int]], known: Names
 ) -> tuple[dict[str, list[Frame]], Names, str]:
     """Read the frames of a CSV file in which fluoroscopes, exposures and targets may have names.
 
+    image_size: returns width and height [px] for the id of a fluoroscope, or raises DataError.
     known: names whose ids are already known. Returns the frames by fluoroscope id, the names of
     the file, and a sentence about excluded points off the image ('' if there are none). Raises
     DataError as `read_observations_csv` does, and if more than a few points are off the image.
@@ -127,34 +132,33 @@ class _Columns:
 
 
 def _read(
-    path: PathLike, image_size: tuple[int, int] | None, columns: _Columns
+    path: PathLike, image_size: Callable[[str], tuple[int, int]], columns: _Columns
 ) -> tuple[dict[str, list[Frame]], str]:
-    if image_size is None:
-        raise DataError(
-            f'{path}: a CSV file does not contain the image size, --image-size WxH is needed'
-        )
     blocks = read_blocks(path, COLUMNS)
     rows = joined_rows([_parse(block, columns) for block in blocks])
-    rows, stray = _on_image(path, rows, image_size, columns.known is not None)
+    names = columns.fluoroscopes()
+    sizes = np.array([image_size(name) for name in names])
+    rows, stray = _on_image(path, rows, sizes[rows.code], columns.known is not None)
     rows = replace(
         rows,
         exposure=columns.exposure.numbers(rows.exposure),
         target_id=columns.target.numbers(rows.target_id),
     )
-    names = columns.fluoroscopes()
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(names)}
     for number, frame_rows in enumerate(_by_frame(rows, names)):
         if number == MAX_FRAMES:
             raise DataError(f'{path}: more than {MAX_FRAMES} frames are not read')
         name = names[frame_rows.code[0]]
-        frames[name].append(_frame(path, name, frame_rows, image_size))
+        frames[name].append(_frame(path, name, frame_rows, sizes[frame_rows.code[0]]))
     return {name: view_frames for name, view_frames in frames.items() if view_frames}, stray
 
 
 def _on_image(
-    path: PathLike, rows: _Rows, image_size: tuple[int, int], leave_out: bool
+    path: PathLike, rows: _Rows, image_size: NDArray[np.int64], leave_out: bool
 ) -> tuple[_Rows, str]:
     """Exclude a few points that are off the image; return the remaining rows and a sentence.
+
+    image_size: (n, 2), width and height of the image of each row [px].
 
     The sentence names the first excluded point and counts the others. Raises DataError if
     leave_out is false or too many points are off the image.
@@ -166,7 +170,7 @@ def _on_image(
     u, v = rows.uv[row]
     sentence = (
         f'{path}, row {rows.line[row]}: the point ({u:g}, {v:g}) is outside the image of '
-        f'{image_size[0]} x {image_size[1]} px'
+        f'{image_size[row, 0]} x {image_size[row, 1]} px'
     )
     if not leave_out or not few(int(is_off.sum()), len(is_off)):
         raise DataError(sentence)
@@ -295,7 +299,7 @@ def _by_frame(rows: _Rows, names: Sequence[str]) -> Iterator[_Rows]:
         yield rows[indices]
 
 
-def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) -> Frame:
+def _frame(path: PathLike, name: str, rows: _Rows, image_size: NDArray[np.int64]) -> Frame:
     """Return the frame with these rows. Raises DataError."""
     where = f'of fluoroscope {name}, exposure {rows.exposure[0]}'
     repeated = first_repeated(rows.target_id)

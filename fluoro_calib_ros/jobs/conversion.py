@@ -52,7 +52,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .result_folder import belongs_to
 from .simulation import write_bag
-from .sources import require_observed, select_calibrations
+from .sources import calibrated_settings, require_observed, select_calibrations
 
 BAG = 'bag'
 PHANTOM_BODY = 'phantom'  # name of the phantom as a rigid body
@@ -127,9 +127,7 @@ def convert(request: ConversionRequest) -> Written:
     calibrations: Calibrations = {}
     if request.calibration is not None:
         calibrations = load_calibrations(request.calibration)
-        size = settings.image_size or next(iter(calibrations.values())).image_size
-        names = read_names(request.calibration).merged(settings.names)
-        settings = replace(settings, image_size=size, names=names)
+        settings = calibrated_settings(settings, request.calibration, calibrations)
     wanted = _parts_written(request.kind)
     read_settings = replace(settings, wanted=wanted, fluoroscopes=tuple(request.fluoroscopes))
     content, is_own = _read(request, read_settings)

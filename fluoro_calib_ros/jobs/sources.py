@@ -333,6 +333,14 @@ def read_calibrations(
     )
 
 
+def calibrated_settings(
+    settings: FileSettings, directory: PathLike, calibrations: Calibrations
+) -> FileSettings:
+    """Return settings with the names of a result folder and the image sizes of calibrations."""
+    sizes = {name: calibration.image_size for name, calibration in calibrations.items()}
+    return replace(settings, names=read_names(directory).merged(settings.names), sizes=sizes)
+
+
 def require_observed(path: object, corrected_by: Mapping[str, str]) -> None:
     """Raise DataError for image points that are already corrected by a calibration."""
     for name, identity in corrected_by.items():
@@ -362,7 +370,7 @@ def read_calibrated_source(
     directory : path-like
         The result folder with the calibrations, whose names are known.
     image_size : (int, int), optional
-        Image size of a file; by default that of the calibration.
+        Image size of a file; by default those of the calibrations.
     fluoroscopes, validate, settings, selection
         As in `read_source`.
 
@@ -377,15 +385,12 @@ def read_calibrated_source(
         Also for a fluoroscope of the source without calibration.
     """
     calibrations = read_calibrations(directory)
-    if image_size is None:
-        image_size = next(iter(calibrations.values())).image_size
-    settings = settings or FileSettings()
     recording = read_source(
         path,
         image_size=image_size,
         fluoroscopes=fluoroscopes,
         validate=validate,
-        settings=replace(settings, names=read_names(directory).merged(settings.names)),
+        settings=calibrated_settings(settings or FileSettings(), directory, calibrations),
         selection=selection,
     )
     select_calibrations(calibrations, recording.frames, directory)
@@ -413,15 +418,13 @@ def _unknown_angles(
         yield f'{path}: {note}{hint}'
 
 
-def read_point_table(
-    path: PathLike, directory: PathLike, settings: FileSettings
-) -> tuple[PointsFile, tuple[str, ...]]:
-    """Read image points to be corrected with the calibrations in a folder, and notes about them.
+def read_point_table(path: PathLike, settings: FileSettings) -> tuple[PointsFile, tuple[str, ...]]:
+    """Read image points to be corrected with calibrations, and notes about them.
 
-    A CSV file with columns u and v keeps its rows and other columns; a file of another program is
-    converted to one row per point. Raises DataError.
+    settings: those of `calibrated_settings`. A CSV file with columns u and v keeps its rows and
+    other columns; a file of another program is converted to one row per point. Raises DataError.
     """
-    names = read_names(directory)
+    names = settings.names
     recognised = registry.recognised(path)
     if (
         recognised is None
@@ -429,6 +432,6 @@ def read_point_table(
         or 'observations' not in recognised.parts
     ):
         return read_points(path, names.fluoroscopes), ()
-    content = read_content(path, replace(settings, names=names), 'observations', recognised.kind)
+    content = read_content(path, settings, 'observations', recognised.kind)
     points = points_of_frames(path, content.observations or {}, names.merged(content.names))
     return points, content.notes

@@ -23,7 +23,7 @@ SIZE = (1024, 1024)
 def _read(path: Path) -> None:
     both(
         lambda: read_observations_csv(path, SIZE),
-        lambda: read_named_observations(path, SIZE, Names()),
+        lambda: read_named_observations(path, lambda _: SIZE, Names()),
     )
 
 

@@ -27,6 +27,7 @@ from fluoro_calib_ros.jobs.conversion import (
     stations_of,
 )
 from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.jobs.sources import read_calibrated_source
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion
 
 SIZE = (320, 240)
@@ -261,3 +262,51 @@ def test_lookup_at_an_unknown_angle_is_told(result):
     (note,) = content(result, 'lookups').notes
     assert ' b depend' in note
     assert content(result, 'lookups', angle=0.5).notes == ()
+
+
+TALL = (320, 300)  # image size of the second of two different detectors [px]
+
+
+@pytest.fixture
+def different(tmp_path):
+    """Result folder of fluoroscopes with detectors of different size, and frames of theirs."""
+    for name, size in (('a', SIZE), ('b', TALL)):
+        save_calibration(tmp_path / 'different', rigs.smooth_pincushion(name, size))
+    uv = np.array([[100.0, 90], [200, 280]])
+    views = {'a': Frame('a', 1, np.array([1]), uv[:1], SIZE)}
+    views['b'] = Frame('b', 1, np.array([1, 2]), uv, TALL)
+    return tmp_path / 'different', views
+
+
+def test_file_without_image_size_has_that_of_each_calibration(different, tmp_path):
+    folder, views = different
+    write_observations_csv(tmp_path / 'seen.csv', views.values())
+    recording, _ = read_calibrated_source(tmp_path / 'seen.csv', folder)
+    assert recording.notes == ()
+    for name, view in views.items():
+        (frame,) = recording.frames[name]
+        assert frame.image_size == view.image_size and frame.uv.tolist() == view.uv.tolist()
+    write_observations_csv(tmp_path / 'z.csv', [replace(views['b'], fluoroscope='z')])
+    with pytest.raises(DataError, match="no calibration of fluoroscope 'z', only of a, b, "):
+        read_calibrated_source(tmp_path / 'z.csv', folder)
+
+
+def test_rows_from_the_bottom_count_from_that_of_each_detector(different, tmp_path):
+    folder, views = different
+    rows = [[f'm{i}_cam{c}_{x}' for i in (1, 2) for c in (1, 2) for x in 'XY'], []]
+    for row in (0, 1):
+        for view in views.values():
+            cells = ['NaN', 'NaN']
+            if row < len(view.uv):
+                u, v = view.uv[row]
+                cells = [str(u), str(view.image_size[1] - 1 - v)]
+            rows[1] += cells
+    (tmp_path / 'xma.csv').write_text('\n'.join(map(','.join, rows)) + '\n')
+    settings = FileSettings(y_up=True)
+    options = {'calibration': folder, 'fluoroscopes': ('a', 'b'), 'settings': settings}
+    convert(
+        ConversionRequest(tmp_path / 'xma.csv', 'observations', tmp_path / 'seen.csv', **options)
+    )
+    recording, _ = read_calibrated_source(tmp_path / 'seen.csv', folder)
+    for name, view in views.items():
+        np.testing.assert_allclose(recording.frames[name][0].uv, view.uv, atol=1e-9)

@@ -136,7 +136,7 @@ def _observations(
     frames: dict[str, list[Frame]] = {}
     for station in sorted(by_station):
         name = cameras.fluoroscope(station)
-        size = settings.image_size or sizes.get(name)
+        size = settings.image_size or sizes.get(name) or settings.size_of(name)
         if size is None:
             raise DataError(
                 f'{path}: without the .iop file the image size is unknown, --image-size WxH is '

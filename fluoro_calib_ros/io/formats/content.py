@@ -208,7 +208,7 @@ class FileSettings:
     Attributes
     ----------
     image_size : (int, int) or None
-        Width and height [px].
+        Width and height [px] of all fluoroscopes.
     units : {'mm', 'cm', 'm'} or None
         Unit of lengths in the file; None: the unit stated by the file or its format.
     one_based : bool
@@ -229,6 +229,8 @@ class FileSettings:
         Parts to read from a file with several parts, names of PARTS.
     decisions : path-like or None
         Table of a person's decisions on doubtful image points and exposures of the file.
+    sizes : mapping of str to (int, int)
+        Width and height [px] by fluoroscope, where image_size is None: those of calibrations.
     """
 
     image_size: tuple[int, int] | None = None
@@ -242,6 +244,7 @@ class FileSettings:
     fluoroscopes: tuple[str, ...] = ()
     wanted: tuple[str, ...] = tuple(PARTS)
     decisions: PathLike | None = None
+    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def fluoroscope_of(self, name: str, where: object) -> str:
         """Return the fluoroscope of a file that names its only camera. Raises DataError."""
@@ -251,13 +254,27 @@ class FileSettings:
         check_safe_name(fluoroscope, where)
         return fluoroscope
 
-    def image_size_of(self, where: object) -> tuple[int, int]:
+    def size_of(self, fluoroscope: str) -> tuple[int, int] | None:
+        """Return the image size of a fluoroscope, None if unknown; a common one is that of all."""
+        sizes = set(self.sizes.values())
+        common = sizes.pop() if len(sizes) == 1 else None
+        return self.image_size or common or self.sizes.get(fluoroscope)
+
+    def image_size_of(self, where: object, fluoroscope: str) -> tuple[int, int]:
         """Return the image size for a file that has none. Raises DataError if it is not set."""
-        if self.image_size is None:
+        size = self.size_of(fluoroscope)
+        if size is not None:
+            return size
+        if self.sizes:
+            names = list(self.sizes)
             raise DataError(
-                f'{where}: this format does not contain the image size, --image-size WxH is needed'
+                f'{where}: there is no calibration of fluoroscope {fluoroscope!r}, only of '
+                f'{", ".join(names)}, whose images are of different size; name the cameras of the '
+                f'file with --fluoroscopes {",".join(names)}'
             )
-        return self.image_size
+        raise DataError(
+            f'{where}: this format does not contain the image size, --image-size WxH is needed'
+        )
 
     def unit_read(self, where: object) -> float:
         """Return the unit in mm for a file that does not state it. Raises DataError if not set."""

@@ -58,7 +58,9 @@ def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
 
 
 def _read_observations(path: Path, settings: FileSettings) -> Content:
-    frames, names, stray = read_named_observations(path, settings.image_size, settings.names)
+    frames, names, stray = read_named_observations(
+        path, lambda name: settings.image_size_of(path, name), settings.names
+    )
     return Content(
         observations=frames,
         names=names,

@@ -78,10 +78,10 @@ def _opencv_camera(path: Path, storage: cv2.FileStorage, settings: FileSettings)
         coefficients = tuple(distortion.ravel().tolist())
     width = storage.getNode('image_width')
     height = storage.getNode('image_height')
-    size = settings.image_size
+    name = name_of_file(path, _OPENCV)
+    size = settings.size_of(name)
     if not width.empty() and not height.empty():
         size = (int(width.real()), int(height.real()))
-    name = name_of_file(path, _OPENCV)
     rotation = _node_matrix(path, storage, ('R',))
     translation = _node_matrix(path, storage, ('T', 't'))
     if rotation is None or translation is None:

@@ -65,8 +65,8 @@ def read_deeplabcut(path: Path, settings: FileSettings) -> Content:
     )
     targets = _body_parts(header, first_column)
     target_id, names = numbered_targets(targets, settings.names.targets)
-    size = settings.image_size_of(path)
     fluoroscope = _fluoroscope_of_table(path, settings)
+    size = settings.image_size_of(path, fluoroscope)
     frames: dict[int, Frame] = {}
     likelihood: list[NDArray[np.float64]] = []
     unsure_count = 0
@@ -213,9 +213,9 @@ def read_sleap(path: Path, settings: FileSettings) -> Content:
     uv = uv.reshape(len(uv), len(targets), 2)
     score = score.reshape(len(uv), len(targets))
     score = np.where(np.isnan(score), 1.0, score)  # NaN: labelled by hand
-    size = settings.image_size_of(path)
     target_id, names = numbered_targets(targets, settings.names.targets)
     fluoroscope = _fluoroscope_of_video(path, settings)
+    size = settings.image_size_of(path, fluoroscope)
     placed = np.isfinite(uv).all(axis=2)
     seen = placed & (score > LEAST_SCORE) & (score < 1 / LEAST_SCORE)
     frames = []

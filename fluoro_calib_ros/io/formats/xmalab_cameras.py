@@ -221,7 +221,6 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
     if len(rows) != 11:
         raise DataError(f'{path}: {len(rows)} rows, but there are 11 coefficients of a DLT')
     require_width(rows, len(rows[0].cells), 'the first row')
-    size = settings.image_size_of(path)
     mm = settings.unit_read(path)
     columns = np.array([row.numbers() for row in rows]).T
     names = settings.fluoroscopes
@@ -230,9 +229,10 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
     ones = np.ones((len(columns), 1))
     projections = np.concatenate([columns, ones], axis=1).reshape(-1, 3, 4)
     downwards = bool((np.linalg.det(projections[:, :, :3]) > 0).all())
-    to_pixels = np.linalg.inv(_file_pixels(size, downwards))
     cameras = []
     for name, projection in zip(names, projections):
+        size = settings.image_size_of(path, name)
+        to_pixels = np.linalg.inv(_file_pixels(size, downwards))
         try:
             cameras.append(_dlt_camera(name, to_pixels @ projection, size, mm))
         except ValueError as error:
@@ -340,13 +340,15 @@ def read(path: Path, settings: FileSettings) -> Content:
         table[index] = values
     maps = table.reshape(2, -1, len(first_row))
     size = (maps.shape[2], maps.shape[1])
-    if settings.image_size not in (None, size):
+    name = name_of_file(path, ENDING)
+    expected = settings.size_of(name) or size
+    if expected != size:
         raise DataError(
             f'{path}: the table is for an image of {size[0]} x {size[1]} px, not of '
-            f'{settings.image_size[0]} x {settings.image_size[1]} px'
+            f'{expected[0]} x {expected[1]} px'
         )
     maps[:, (maps == NOWHERE).any(axis=0)] = np.nan
-    return Content(lookups={name_of_file(path, ENDING): maps})
+    return Content(lookups={name: maps})
 
 
 def _float32_numbers(path: Path, number: int, line: str, separator: str) -> list[float]:

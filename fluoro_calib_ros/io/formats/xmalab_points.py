@@ -51,17 +51,18 @@ def read(path: Path, settings: FileSettings) -> Content:
     labels = _labels(cameras, settings)
     frames: dict[str, list[Frame]] = {labels[camera]: [] for camera in cameras}
     column_camera = np.array([camera for _, camera in header[::2]])
-    size = settings.image_size_of(path)
+    sizes = {camera: settings.image_size_of(path, labels[camera]) for camera in cameras}
+    column_size = np.array([sizes[camera] for camera in column_camera.tolist()])
     for number, row in zip(frame_numbers(rows, first_column), rows):
         _check_offsets(row, first_column, offsets)
-        uv = _pixels(row.numbers_or_nan(first_column + offsets), settings, size)
-        _check_point(row, uv, size, header)
+        uv = _pixels(row.numbers_or_nan(first_column + offsets), settings, column_size)
+        _check_point(row, uv, column_size, header)
         for camera in cameras:
             used = (column_camera == camera) & ~np.isnan(uv).any(axis=1)
             if used.any():
                 name = labels[camera]
                 points = (column_id[used], uv[used])
-                frames[name].append(frame_of(row.place, name, number, *points, size))
+                frames[name].append(frame_of(row.place, name, number, *points, sizes[camera]))
     return Content(
         observations={name: view_frames for name, view_frames in frames.items() if view_frames},
         names=names,
@@ -128,20 +129,23 @@ def _check_offsets(row: Row, first: int, offsets: int) -> None:
 
 
 def _pixels(
-    values: Sequence[float], settings: FileSettings, size: tuple[int, int]
+    values: Sequence[float], settings: FileSettings, size: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Convert to our pixels (n, 2), NaN where either coordinate is missing."""
+    """Convert to our pixels (n, 2), NaN where either coordinate is missing.
+
+    size: (n, 2), width and height of the image of each point [px].
+    """
     uv = np.array(values).reshape(-1, 2)
     if settings.one_based:
         uv = uv - 1.0
     if settings.y_up:
-        uv[:, 1] = size[1] - 1 - uv[:, 1]
+        uv[:, 1] = size[:, 1] - 1 - uv[:, 1]
     uv[np.isnan(uv).any(axis=1)] = np.nan
     return uv
 
 
 def _check_point(
-    row: Row, uv: NDArray[np.float64], size: tuple[int, int], header: Sequence[tuple[str, int]]
+    row: Row, uv: NDArray[np.float64], size: NDArray[np.int64], header: Sequence[tuple[str, int]]
 ) -> None:
     """Raise DataError for a point off the image."""
     is_off_image = ~points_on_image(uv, size) & ~np.isnan(uv).any(axis=1)
@@ -150,7 +154,7 @@ def _check_point(
         target, camera = header[2 * index]
         row.fail(
             f'the point ({uv[index, 0]:g}, {uv[index, 1]:g}) of {target} in cam{camera} is '
-            f'outside the image of {size[0]} x {size[1]} px'
+            f'outside the image of {size[index, 0]} x {size[index, 1]} px'
         )
 
 

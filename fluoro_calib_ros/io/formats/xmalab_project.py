@@ -133,12 +133,14 @@ class _Project:
                 check_size(*size)
             if min(size) > 0:
                 return size
-        if self.settings.image_size is None:
+        name = self.archive.text(camera, 'Name')
+        given = self.settings.size_of(self.ids[name])
+        if given is None:
             raise DataError(
                 f'{self.archive.path}: the project does not contain the image size of '
-                f'{self.archive.text(camera, "Name")}, --image-size WxH is needed'
+                f'{name}, --image-size WxH is needed'
             )
-        return self.settings.image_size
+        return given
 
     def trial(self) -> ElementTree.Element:
         """Return the chosen trial. Raises DataError."""

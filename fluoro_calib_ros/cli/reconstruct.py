@@ -84,9 +84,11 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.reconstruction import ReconstructionOptions, reconstruct
 
     path = arguments.orientation or orientation_path(arguments.calibration)
-    check_output_file(arguments.out, (arguments.source, arguments.calibration, path))
+    inputs = [arguments.source, arguments.calibration, path]
+    inputs += filter(None, [arguments.decisions])
+    check_output_file(arguments.out, inputs)
     if arguments.figure is not None:
-        check_output_file(arguments.figure, (arguments.source, arguments.out))
+        check_output_file(arguments.figure, [*inputs, arguments.out])
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
     frames = recording.frames

@@ -89,10 +89,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Survey a phantom and write it. Raises DataError, also for the verdict 'fail'."""
     from ..estimation.options import CalibrationOptions
+    from ..io.folder import check_output_file
     from ..io.phantom import write_phantom
     from ..jobs.sources import read_survey
     from ..jobs.survey import SurveyRequest, survey
 
+    inputs = [arguments.source, arguments.phantom]
+    check_output_file(arguments.out, [*inputs, *filter(None, [arguments.decisions])])
     initial = read_survey(arguments.phantom, file_settings(arguments))
     recording = read_exposures(arguments, initial.names)
     print_inputs(arguments.source, initial, recording)

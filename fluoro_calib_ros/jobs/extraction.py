@@ -24,6 +24,7 @@ from ..images.overlay import small_jpeg
 from ..images.view import Lens, assumed_lens, lacks_certain_pose, shared_lens
 from ..io.access import check_safe_name, make_folder, write_bytes
 from ..io.bags.reader import image_topics
+from ..io.folder import check_output_file
 from .followers import Observations, PhantomSettings
 from .image_sources import (
     ImageAngles,
@@ -186,7 +187,7 @@ def run_extraction(
     if request.regular_grid and FlatGrid.of(request.phantom.xyz_mm) is None:
         raise DataError('the phantom is not a flat grid with rows and columns')
     if request.overlay is not None:
-        make_folder(request.overlay)
+        make_picture_folder(request.overlay, request.fluoroscope, request.sources)
     with open_workers(request.workers, request.scheduler, sources.count) as workers:
         results = _first_pass(request, sources, workers, progress)
         _second_pass(request, sources, workers, results)
@@ -300,6 +301,19 @@ def _task(request: ExtractionRequest, images: tuple[SourceImage, ...], lens: Len
         regular_grid=request.regular_grid,
     )
     return _Task(images, settings, request.overlay is not None, request.radiographs)
+
+
+def make_picture_folder(folder: Path, fluoroscope: str, sources: Iterable[Path]) -> None:
+    """Create a folder for pictures FLUOROSCOPE_EXPOSURE.png.
+
+    Raises DataError if they could replace images of the sources.
+    """
+    make_folder(folder)
+    pattern = f'{fluoroscope}_*.png'
+    for source in sources:
+        for path in source.glob(pattern) if source.is_dir() else [source]:
+            if path.match(pattern):
+                check_output_file(folder / path.name, [path])
 
 
 def _with_picture_written(request: ExtractionRequest, result: ImageResult) -> ImageResult:

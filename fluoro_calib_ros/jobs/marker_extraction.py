@@ -33,9 +33,9 @@ from ..images.marker_decisions import Decision, EarlierImages
 from ..images.marker_ids import identifiable, identify_markers
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.overlay import draw_markers
-from ..io.access import make_folder, write_bytes
+from ..io.access import write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
-from .extraction import Progress
+from .extraction import Progress, make_picture_folder
 from .followers import MarkerFollower, MarkerSettings
 from .image_sources import (
     ImageAngles,
@@ -233,7 +233,8 @@ def run_marker_extraction(
     names = list(request.sources)
     sources = {name: open_sources(request.sources[name], name, request.angles) for name in names}
     if request.overlay is not None:
-        make_folder(request.overlay)
+        for name in names:
+            make_picture_folder(request.overlay, name, request.sources[name])
     recording = _Recording(request)
     total = max(source.count for source in sources.values())
     cv2.setNumThreads(1)

@@ -30,6 +30,7 @@ from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
 from fluoro_calib_ros.healing.diagnosis import Cause
 from fluoro_calib_ros.io.bags.salvage import BagReport, Damage, TopicReport
 from fluoro_calib_ros.io.phantom import read_phantom
+from fluoro_calib_ros.jobs.extraction import make_picture_folder
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions
 from fluoro_calib_ros.jobs.scheduling import Cluster
 
@@ -436,6 +437,7 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         orientation=tmp_path / 'o',
         calibration='c',
         out='p.csv',
+        decisions=None,
         figure=None,
         no_drift_watch=True,
         bodies=(),
@@ -448,6 +450,35 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         assert '2.5 times, to 10.0 standard deviations' in said
     else:
         assert said == ''
+
+
+def test_survey_and_figure_do_not_overwrite_what_is_read(tmp_path):
+    names = ('seen.csv', 'phantom.csv', 'decisions.csv', 'a.calibration.npz')
+    seen, phantom, decisions, calibration = (tmp_path / name for name in names)
+    for path in (seen, phantom, decisions, calibration):
+        path.touch()
+    given = {'source': seen, 'decisions': decisions}
+    for out in (seen, phantom, decisions):
+        with pytest.raises(DataError, match='overwritten'):
+            survey_command.run(Fake(**given, phantom=phantom, out=out))
+    out = tmp_path / 'points.csv'
+    folder = {'calibration': tmp_path, 'orientation': None}
+    for figure in (seen, decisions, calibration):
+        with pytest.raises(DataError, match='overwritten'):
+            reconstruct_command.run(Fake(**given, **folder, out=out, figure=figure))
+
+
+def test_pictures_do_not_replace_the_images_that_they_show(tmp_path):
+    for folder, names in (('images', ['a_0001.png', '0002.png']), ('pictures', ['a_0001.png'])):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            (tmp_path / folder / name).touch()
+    images = tmp_path / 'images'
+    for sources in ([images], [images / '0002.png', images / 'a_0001.png']):
+        with pytest.raises(DataError, match='would be overwritten'):
+            make_picture_folder(images, 'a', sources)
+        make_picture_folder(images, 'b', sources)
+        make_picture_folder(tmp_path / 'pictures', 'a', sources)
 
 
 def test_convert_does_not_overwrite_what_it_reads(tmp_path):

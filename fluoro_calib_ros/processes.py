@@ -316,7 +316,8 @@ def _serve(
 ) -> None:
     """Answer calls until the caller has closed the connection or died."""
     use_read_limits(limits)
-    os.nice(resources.nice)
+    if hasattr(os, 'nice'):  # Windows has no such number
+        os.nice(resources.nice)
     with ExitStack() as stack:
         stack.enter_context(suppress(EOFError, BrokenPipeError, ConnectionResetError))
         if resources.one_core:
@@ -371,8 +372,11 @@ def interrupts_blocked() -> Iterator[None]:
     """Block keyboard interrupts in the processes that are started in this context.
 
     They inherit the signal mask of the calling thread: an interrupt only reaches the caller, which
-    ends them.
+    ends them. Windows has no signal masks.
     """
+    if not hasattr(signal, 'pthread_sigmask'):
+        yield
+        return
     resource_tracker.ensure_running()  # starting it unblocks interrupts
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:

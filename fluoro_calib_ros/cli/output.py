@@ -12,7 +12,7 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
 from ..errors import printable
@@ -187,21 +187,32 @@ def terminated_by_signals() -> Iterator[None]:
     def terminate(number: int, _: object) -> None:
         error = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
         raised.append(error)
-        signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
+        _repeat_after(AGAIN_S)
         raise error
 
     def repeat(_number: int, _frame: object) -> None:
         if not _is_handled(raised):
             raise raised[-1]
 
-    handlers = {signal.SIGINT: terminate, signal.SIGTERM: terminate, signal.SIGALRM: repeat}
+    handlers: dict[int, Callable[[int, object], None]] = {
+        signal.SIGINT: terminate,
+        signal.SIGTERM: terminate,
+    }
+    if hasattr(signal, 'SIGALRM'):
+        handlers[signal.SIGALRM] = repeat
     previous = {number: signal.signal(number, handlers[number]) for number in handlers}
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        _repeat_after(0.0)
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _repeat_after(interval_s: float) -> None:
+    """Request SIGALRM at an interval, 0: no more; Windows has no such signal."""
+    if hasattr(signal, 'setitimer'):
+        signal.setitimer(signal.ITIMER_REAL, interval_s, interval_s)
 
 
 def _is_handled(raised: list[BaseException]) -> bool:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import fcntl
 import os
 import secrets
 import shutil
@@ -27,6 +26,11 @@ from pathlib import Path
 
 from ..errors import DataError
 from .access import PathLike, make_folder, os_error_reason, os_errors, sync_folder
+
+try:
+    import fcntl
+except ImportError:  # Windows, where a folder can be neither opened nor locked
+    fcntl = None  # type: ignore[assignment]
 
 PREVIOUS = '.previous'
 # Suffixes of the files of a bag or a result folder that are read as inputs.
@@ -242,7 +246,8 @@ def keep_as_previous(folder: str, target: str) -> None:
 
 def _exchange(first: str, second: str) -> None:
     """Exchange the names of two folders in one step (renameat2 of Linux). Raises OSError."""
-    function = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
+    library = None if fcntl is None else ctypes.CDLL(None, use_errno=True)
+    function = getattr(library, 'renameat2', None)
     if function is None:
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
     paths = (os.fsencode(first), os.fsencode(second))
@@ -270,7 +275,7 @@ def _carry_over(old: str, new: str, kind: FolderKind) -> None:
     def link(source: str, copy: str) -> None:
         try:
             os.link(source, copy, follow_symlinks=False)
-        except OSError:
+        except (OSError, NotImplementedError):
             shutil.copy2(source, copy, follow_symlinks=False)
 
     for name in sorted(os.listdir(old)):
@@ -287,9 +292,9 @@ def _make_locked(path: str) -> int:
     """Create a folder that is locked as long as this process lives; return its lock."""
     while True:
         os.mkdir(path)
-        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        lock = _open_folder(path)
         with suppress(OSError):  # no locks in this file system, or another run cleans up now
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(lock)
         if os.path.isdir(path):
             return lock
         os.close(lock)
@@ -297,14 +302,23 @@ def _make_locked(path: str) -> int:
 
 def _is_locked(path: str) -> bool:
     """Return whether a run is still writing to a folder."""
-    lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    lock = _open_folder(path)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock(lock)
     except BlockingIOError:
         return True
     finally:
         os.close(lock)
     return False
+
+
+def _open_folder(path: str) -> int:
+    return os.open(path, os.O_RDONLY | os.O_DIRECTORY) if fcntl else os.open(os.devnull, 0)
+
+
+def _lock(folder: int) -> None:
+    if fcntl:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _leftovers(folder: str, name: str) -> list[str]:

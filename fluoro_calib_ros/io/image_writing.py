@@ -166,7 +166,7 @@ def _check_written(out: Path, path: Path, count: int) -> None:
     video.release()
     if not complete:
         raise DataError(f'{out}: cannot be written (is the disk full?)')
-    with open(path, 'rb') as file:
+    with open(path, 'rb+') as file:
         os.fsync(file.fileno())
 
 

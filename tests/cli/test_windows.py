@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Commands without the functions of Python that Windows does not have."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fluoro_calib_ros.io.calibration import load_calibrations
+
+BAGS = Path(__file__).resolve().parents[2] / 'bags'
+
+WITHOUT = """
+import os
+import signal
+import sys
+
+for name in ('fcntl', 'resource', 'termios', 'pwd', 'grp'):
+    sys.modules[name] = None
+for module, names in (
+    (signal, 'SIGALRM SIGHUP SIGVTALRM ITIMER_REAL setitimer alarm pause pthread_sigmask'),
+    (signal, 'SIG_BLOCK SIG_SETMASK sigwait pthread_kill'),
+    (os, 'nice getuid geteuid killpg setsid mkfifo statvfs sched_getaffinity O_DIRECTORY fork'),
+):
+    for name in names.split():
+        delattr(module, name)
+if __name__ == '__main__':
+"""
+COMMAND = '    from fluoro_calib_ros.cli import main\n    sys.exit(main(sys.argv[1:]))\n'
+WORKER = """
+    from fluoro_calib_ros.processes import in_worker_process
+
+    assert in_worker_process('findings:first_few', [1, 2]) == '1, 2'
+"""
+
+
+@pytest.fixture
+def run(tmp_path):
+    def run(program, *words):
+        path = tmp_path / 'program.py'
+        path.write_text(WITHOUT + program)
+        done = subprocess.run(
+            [sys.executable, path, *map(str, words)], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+
+    return run
+
+
+def test_commands_need_no_function_that_windows_lacks(run, tmp_path):
+    out = tmp_path / 'result'
+    words = (BAGS / 'calibration', '--phantom', BAGS / 'phantom.csv', '--fluoroscopes', 'a')
+    for model in ('none', 'parametric'):  # the second replaces the first
+        run(COMMAND, 'calibrate', *words, '--fast', '--model', model, '--out', out)
+    assert load_calibrations(out)['a'].model.kind == 'parametric'
+    assert load_calibrations(f'{out}.previous')['a'].model.kind == 'none'
+
+
+def test_worker_processes_need_no_function_that_windows_lacks(run):
+    run(WORKER)

@@ -141,8 +141,8 @@ __all__ = [
 
 
 def calibrate(
-    frames: Mapping[str, Sequence[Frame]] | PathLike,
-    phantom: Phantom | PathLike,
+    frames: Mapping[str, Sequence[Frame]] | Recording | PathLike,
+    phantom: Phantom | Survey | PathLike,
     options: CalibrationOptions | None = None,
     *,
     joint: bool = False,
@@ -154,11 +154,13 @@ def calibrate(
 
     Parameters
     ----------
-    frames : mapping of str to sequence of Frame, or path-like
+    frames : mapping of str to sequence of Frame, Recording, or path-like
         Exposures of the phantom by fluoroscope; or a bag or file with them, or a folder with one
-        folder of images per fluoroscope.
-    phantom : Phantom or path-like
-        The surveyed phantom, or the file of the survey.
+        folder of images per fluoroscope. A file without image size, such as a CSV file, is read
+        by `read_source`, which takes it; with FileSettings(names=survey.names) if it has names.
+    phantom : Phantom, Survey or path-like
+        The surveyed phantom, or the file of the survey. Names of a Survey and a Recording are
+        saved with the result.
     options : CalibrationOptions, optional
     joint : bool
         Whether all fluoroscopes are adjusted together; otherwise one after the other.
@@ -184,15 +186,20 @@ def calibrate(
     ValueError
         For options that contradict each other.
     """
-    survey = Survey(phantom, Names()) if isinstance(phantom, Phantom) else read_survey(phantom)
-    if not isinstance(frames, Mapping):
-        frames = _frames_in(Path(frames), survey, principal_distance, progress)
+    if isinstance(phantom, Phantom):
+        phantom = Survey(phantom, Names())
+    survey = phantom if isinstance(phantom, Survey) else read_survey(phantom)
+    if isinstance(frames, Mapping):
+        frames = Recording({name: list(view_frames) for name, view_frames in frames.items()})
+    if not isinstance(frames, Recording):
+        frames = _recording_in(Path(frames), survey, principal_distance, progress)
     request = CalibrationRequest(
-        frames,
+        frames.frames,
         survey.phantom,
         options or CalibrationOptions(),
         joint,
         principal_distance,
+        names=survey.names.merged(frames.names),
     )
     return _calibrated(request, validated, progress)
 
@@ -238,19 +245,20 @@ def calibrate_with_known_orientations(
     return _calibrated(request, validated, progress)
 
 
-def _frames_in(
+def _recording_in(
     source: Path,
     survey: Survey,
     principal_distance: float | None,
     progress: Callable[[str, int, int], None] | None,
-) -> Mapping[str, Sequence[Frame]]:
+) -> Recording:
     """Read the exposures of a bag or file, or extract the beads of images. Raises DataError."""
     if not contains_images(source):
-        return read_source(source, collect='auto').frames
+        settings = FileSettings(names=survey.names)
+        return read_source(source, collect='auto', settings=settings)
     report_image = None if progress is None else partial(progress, 'image')
     return recording_of_images(
         source, survey, principal_distance_px=principal_distance, progress=report_image
-    ).frames
+    )
 
 
 def _calibrated(

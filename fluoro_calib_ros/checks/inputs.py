@@ -138,10 +138,13 @@ def validate_magnitudes(frames: Frames, phantom: Phantom) -> None:
 
 
 def validate_names(names: Iterable[str]) -> None:
-    """Raise DataError for names of fluoroscopes that differ only in capital letters.
+    """Raise DataError for names of fluoroscopes that differ only in capital letters, and for none.
 
     Such names denote one fluoroscope, and are the same file on case-insensitive systems.
     """
+    names = list(names)
+    if not names:
+        raise DataError('there are no frames of any fluoroscope')
     seen: dict[str, str] = {}
     for name in names:
         other = seen.setdefault(name.lower(), name)

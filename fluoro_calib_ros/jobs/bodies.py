@@ -53,6 +53,7 @@ from ..reconstruction.reconstruct import (
     pair_recording,
 )
 from .image_sources import fluoroscope_folders, is_image_bag, open_sources
+from .reconstruction import check_orientation
 
 FILM_HZ = 25.0  # slow motion, because players cannot show 250 images per second
 
@@ -389,6 +390,7 @@ def intersected(
     progress: Callable[[int, int], None] | None = None,
 ) -> IntersectedRecording:
     """Pair and intersect the frames of a recording. Raises DataError, as `reconstruct` does."""
+    check_orientation(orientation, calibrations)
     names = orientation.fluoroscopes
     frames, noise = with_observed_noise(frames, calibrations, orientation, options)
     paired, unpaired = pair_recording(frames, names, options)

@@ -65,7 +65,8 @@ def adjust(
 ) -> CalibrationResult:
     """Adjust exposures of the phantom with interior orientations and corrections fixed.
 
-    A few image points that are off the image, or do not belong to the phantom, are excluded.
+    A few image points that are off the image, or do not belong to the phantom, are excluded, and
+    exposures that repeat the image points of an earlier one.
 
     Parameters
     ----------
@@ -84,11 +85,15 @@ def adjust(
     Raises
     ------
     DataError
-        For a missing calibration, and for frames that do not suffice, cannot be of the phantom, or
-        are already corrected.
+        For a missing calibration, implausible numbers, and for frames that do not suffice, cannot
+        be of the phantom, or are already corrected.
     """
+    validate_names(frames)
+    validate_magnitudes(frames, phantom)
     used = select_calibrations(calibrations, frames)
     cleaned, strays = frames_without_strays(frames, phantom)
+    cleaned, copies = _without_copies(cleaned, (), minimum=1)
+    cleaned, shared = _without_shared(cleaned)
     require_phantom(cleaned, phantom)
     cleaned = with_comparable_sigma(cleaned, used)
     result = adjust_with_calibrations(cleaned, phantom, used, loss)
@@ -97,7 +102,7 @@ def adjust(
         finding = corrected_already(result, uncorrected_result, used, cleaned)
         if finding is not None:
             raise DataError(finding)
-    findings = (*strays, *result.findings, *poor_fits(result, used, cleaned))
+    findings = (*strays, *copies, *shared, *result.findings, *poor_fits(result, used, cleaned))
     return replace(result, findings=findings)
 
 
@@ -315,12 +320,12 @@ def without_unusable(request: CalibrationRequest) -> tuple[CalibrationRequest, l
 
 
 def _without_copies(
-    frames: Frames, known: Container[str]
+    frames: Frames, known: Container[str], minimum: int = MIN_EXPOSURES
 ) -> tuple[dict[str, list[Frame]], list[Finding]]:
     """Return the frames without repeated exposures, and a finding for each of these.
 
     A fluoroscope with known orientation is fixed, so it may see the same points again. Raises
-    DataError if too few exposures are left.
+    DataError if fewer than a minimum of exposures are left.
     """
     out = {}
     findings = []
@@ -328,10 +333,10 @@ def _without_copies(
         copies = [] if name in known else copied_exposures(exposures)
         numbers = {copy.number for copy, _ in copies}
         out[name] = [frame for frame in exposures if frame.number not in numbers]
-        if copies and len(out[name]) < MIN_EXPOSURES:
+        if copies and len(out[name]) < minimum:
             raise DataError(
                 f'{len(copies)} of {len(exposures)} exposures repeat the image points of '
-                f'another one, {MIN_EXPOSURES} different exposures are needed',
+                f'another one, {minimum} different exposures are needed',
                 kind=Kind.COPIED_EXPOSURE,
                 place=Place((name,), tuple(sorted(numbers)), name=f'fluoroscope {name}'),
             )

@@ -141,6 +141,7 @@ def reconstruct(
             'the recording does not contain the times of its exposures, pair them by frame_number'
         )
     orientation = orientation_of_recorded(frames, orientation)
+    check_orientation(orientation, calibrations)
     names = orientation.fluoroscopes
     frames, noise = with_observed_noise(frames, calibrations, orientation, options)
     watch, drift = _drift_watch(orientation, calibrations, options)

@@ -273,7 +273,8 @@ class FileSettings:
                 f'file with --fluoroscopes {",".join(names)}'
             )
         raise DataError(
-            f'{where}: this format does not contain the image size, --image-size WxH is needed'
+            f'{where}: this format does not contain the image size, --image-size WxH is needed '
+            '(in Python image_size of read_source)'
         )
 
     def unit_read(self, where: object) -> float:

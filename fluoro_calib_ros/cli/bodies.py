@@ -157,6 +157,7 @@ def run(arguments: argparse.Namespace) -> bool:
             options=options,
             progress=bar,
         )
+    learned = None
     if arguments.learn:
         with ErrorsAt(arguments.source), ProgressBar('learned shapes', 'exposure') as bar:
             learned = learn_shapes(
@@ -167,15 +168,16 @@ def run(arguments: argparse.Namespace) -> bool:
                 options=options,
                 progress=bar,
             )
-        write_learned_shapes(arguments.calibration, learned)
-        names = ', '.join(body.name for body in learned.bodies)
-        print_notes([f'{arguments.calibration}: shapes of {names} are learned'])
     with ProgressBar('film') as bar:
         film = None
         if arguments.film is not None:
             views = orientation.subset(list(recording.frames))
             film = Film(arguments.film, calibrations, views, bar)
         save_bodies(arguments.out, outcome, arguments.report, film)
+    if learned is not None:
+        write_learned_shapes(arguments.calibration, learned)
+        names = ', '.join(body.name for body in learned.bodies)
+        print_notes([f'{arguments.calibration}: shapes of {names} are learned'])
     print_unpaired(arguments.source, outcome.unpaired)
     print_rig_evidence(arguments.source, outcome, arguments.reject)
     print_findings(outcome.findings, 'doubtful: ')

@@ -8,10 +8,11 @@ from __future__ import annotations
 import argparse
 
 from ..errors import ErrorsAt
-from ..findings import sentences
+from ..findings import Kind, sentences
 from .arguments import (
     add_bag_options,
     add_calibration,
+    add_exit_zero,
     add_phantom,
     add_source,
     read_calibrated_exposures,
@@ -59,14 +60,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N,N-M',
         help='numbers of the frames in which the phantom stands in the rig frame (default: all)',
     )
+    add_exit_zero(parser)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Orient the rig and write DIR/rig_orientation.npz. Raises DataError."""
-    from ..io.calibration import save_orientation
+def run(arguments: argparse.Namespace) -> bool:
+    """Orient the rig and write DIR/rig_orientation.npz; return whether the targets meet.
+
+    Raises DataError.
+    """
     from ..io.result_document import orientation_document
     from ..jobs.orientation import orient
-    from ..jobs.result_folder import belongs_to, saved_orientation
+    from ..jobs.result_folder import belongs_to, replace_orientation, saved_orientation
     from ..report.tables import orientation_text
 
     survey, recording, calibrations = read_calibrated_exposures(arguments)
@@ -81,7 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
         saved = None
     with ErrorsAt(arguments.source):
         outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id, present=saved)
-    path = save_orientation(arguments.calibration, outcome.orientation)
+    path = replace_orientation(arguments.calibration, outcome.orientation)
     print_notes(outcome.findings)
     document = {
         'out': path,
@@ -98,4 +102,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     lines.append(f'written to {path}')
     reconstruct = ('reconstruct', 'MEASURED', '--calibration', arguments.calibration)
-    print_result(arguments, document, '\n'.join(lines), (*reconstruct, '--out', 'points.csv'))
+    met = not any(finding.kind is Kind.RAYS_DO_NOT_MEET for finding in outcome.findings)
+    next_step = (*reconstruct, '--out', 'points.csv') if met else ()
+    print_result(arguments, document, '\n'.join(lines), next_step)
+    return met

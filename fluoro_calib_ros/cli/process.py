@@ -19,7 +19,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -39,6 +39,7 @@ EXAMPLE = 'fluoro-calib process knee_study'
 STATE = 'study.json'  # completed steps, with digests of their inputs
 TABLE = 'trials.csv'
 LOG = 'log.txt'
+PROMPT = '$ '  # before a command in the log
 POLL_S = 0.05  # interval between polls of the running commands
 NOT_PASSED = 3  # exit status of a step whose verdict is not pass
 SOURCE = 'source'
@@ -253,6 +254,7 @@ class _StepMaker:
             if name != SOURCE:
                 all_words += _option_words(key, value, error)
         values = vars(self._parse(all_words, error))
+        rig_file = values.get('rig_file')
         paths = [
             path
             for key, value in values.items()
@@ -260,6 +262,7 @@ class _StepMaker:
             for path in (value if isinstance(value, list) else [value])
             if isinstance(path, Path)
         ]
+        paths += [rig_file.path] if rig_file is not None else []
         return Step(trial, tuple(all_words), tuple(paths), out)
 
 
@@ -333,7 +336,7 @@ class _Work:
             make_folder(folder)
             print_status(f'{step.key} ({place})')
             with open(folder / LOG, 'a', encoding='utf-8') as log:
-                log.write(f'$ {shlex.join(("fluoro-calib", *step.words))}\n')
+                log.write(f'{PROMPT}{shlex.join(("fluoro-calib", *step.words))}\n')
             process = self._programs.run(
                 'fluoro_calib_ros.cli',
                 *step.words,
@@ -375,9 +378,9 @@ class _Work:
 
 
 def _last_line(path: Path) -> str:
-    """Return the last line of a log, which is the final message of a command."""
-    lines = path.read_text(errors='replace').strip().splitlines()
-    return shortened(lines[-1]) if lines else 'it ended without a message'
+    """Return the last line of a log, which is the final message of a command, if it has one."""
+    last = path.read_text(errors='replace').strip().splitlines()[-1]
+    return 'it ended without a message' if last.startswith(PROMPT) else shortened(last)
 
 
 def digest_of(step: Step) -> str:
@@ -385,7 +388,10 @@ def digest_of(step: Step) -> str:
 
     The state of a file is its size and modification time, as in make.
     """
-    program = version('fluoro_calib_ros')
+    try:
+        program = version('fluoro_calib_ros')
+    except PackageNotFoundError:
+        program = 'from source'
     digest = hashlib.sha256('\0'.join((program, *step.words)).encode())
     for path in step.inputs:
         files = sorted(path.rglob('*')) if path.is_dir() else [path]

@@ -25,6 +25,8 @@ USED = {
     'report': ('calibration',),
     'orient': (*_SOURCE, 'phantom', 'calibration'),
     'reconstruct': (*_SOURCE, 'calibration'),
+    'bodies': (*_SOURCE, 'calibration'),
+    'heal': (*_SOURCE, 'calibration'),
     'convert': _IMAGES,  # --units also applies to its output
     'watch': (),  # only the table [about]
 }

@@ -18,7 +18,7 @@ from ..estimation.result import CalibrationResult
 from ..exposures.names import Names
 from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
-from ..io.access import PathLike
+from ..io.access import PathLike, read_bytes, write_bytes
 from ..io.calibration import (
     KNOWN_ORIENTATION,
     OBSERVATIONS,
@@ -39,7 +39,7 @@ from ..io.calibration import RESULT_NAME as RESULT
 from ..io.calibration_request import RADIOGRAPHS, write_request
 from ..io.decisions import DOUBTFUL, doubtful_table
 from ..io.documents import write_json
-from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.folder import PREVIOUS, FolderKind, check_output_folder, replaced_folder
 from ..io.result_document import NAMES as TABLES
 from ..io.result_document import SUFFIX as COVARIANCE
 from ..io.result_document import result_document, result_tables, write_covariance, write_validation
@@ -54,7 +54,8 @@ REPORT_PDF = 'report.pdf'
 RESULT_FOLDER = FolderKind(
     'a result folder',
     parts=(
-        *(RESULT, OBSERVATIONS, PHANTOM, OPTIONS, KNOWN_ORIENTATION, ORIENTATION),
+        *(RESULT, OBSERVATIONS, PHANTOM, OPTIONS, KNOWN_ORIENTATION),
+        *(ORIENTATION, ORIENTATION + PREVIOUS),
         *(names.NAMES_FILE, VALIDATION_NAME, *TABLES, DOUBTFUL, f'*{COVARIANCE}'),
         *('figures', RADIOGRAPHS, REPORT, REPORT_PDF),
     ),
@@ -152,6 +153,18 @@ def save_calibrations(
             save_calibration(folder, calibration)
         if orientation is not None:
             save_orientation(folder, orientation)
+
+
+def replace_orientation(directory: PathLike, orientation: RigOrientation) -> str:
+    """Write an orientation into a result folder; keep another one as the previous file.
+
+    Returns the path. Raises DataError.
+    """
+    saved = saved_orientation(directory)
+    if saved is not None and saved.orientation_id != orientation.orientation_id:
+        path = orientation_path(directory)
+        write_bytes(path + PREVIOUS, read_bytes(path))
+    return save_orientation(directory, orientation)
 
 
 def save_healed_version(

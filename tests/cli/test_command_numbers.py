@@ -7,6 +7,7 @@ import argparse
 import io
 import json
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from types import SimpleNamespace as Fake
 
@@ -15,7 +16,18 @@ import pytest
 from rigs import run
 
 from fluoro_calib_ros.checks.check import Check
-from fluoro_calib_ros.cli import bag, calibrate, convert, extract, heal, output, phantom, process
+from fluoro_calib_ros.cli import (
+    bag,
+    bodies,
+    calibrate,
+    convert,
+    extract,
+    heal,
+    output,
+    parse_words,
+    phantom,
+    process,
+)
 from fluoro_calib_ros.cli import reconstruct as reconstruct_command
 from fluoro_calib_ros.cli import report as report_command
 from fluoro_calib_ros.cli import survey as survey_command
@@ -481,6 +493,31 @@ def test_pictures_do_not_replace_the_images_that_they_show(tmp_path):
         make_picture_folder(tmp_path / 'pictures', 'a', sources)
 
 
+def test_shapes_are_learned_only_if_all_output_is_written(monkeypatch, tmp_path):
+    def save_bodies(*_):
+        raise DataError('the film cannot be written')
+
+    learned = []
+    recording = Fake(notes=(), frames={})
+    fakes = {
+        'jobs.bodies.track_bodies': lambda *_, **__: None,
+        'jobs.bodies.save_bodies': save_bodies,
+        'jobs.learning.learn_shapes': lambda *_, **__: 'learned',
+        'io.bodies.read_bodies': lambda _: [],
+        'io.folder.check_output_folder': lambda *_: None,
+        'io.versions.write_learned_shapes': lambda *words: learned.append(words),
+    }
+    for name, fake in fakes.items():
+        monkeypatch.setattr(f'fluoro_calib_ros.{name}', fake)
+    monkeypatch.setattr(bodies, 'read_oriented_source', lambda *_: (recording, {}, None))
+    parser = argparse.ArgumentParser()
+    bodies.add_arguments(parser)
+    words = ['x.csv', '--rate', '1', '--bodies', 'b', '--calibration', 'c', '--out', 'o']
+    with pytest.raises(DataError, match='the film'):
+        bodies.run(parser.parse_args([*words, '--learn']))
+    assert learned == []
+
+
 def test_convert_does_not_overwrite_what_it_reads(tmp_path):
     source = tmp_path / 'a.csv'
     for out in (source, tmp_path / 'x' / '..' / 'a.csv'):
@@ -772,5 +809,31 @@ def test_steps_are_digested_with_words_inputs_and_their_state(tmp_path):
     log = tmp_path / 'log'
     log.write_text('one\ntwo\nthree\n\n')
     assert process._last_line(log) == 'three'
-    log.write_text('')
+    log.write_text('the message of an earlier step\n$ fluoro-calib reconstruct x\n')
     assert 'without a message' in process._last_line(log)
+
+
+def test_steps_of_a_program_that_is_not_installed_are_digested(monkeypatch):
+    def version(_):
+        raise PackageNotFoundError
+
+    installed = process.digest_of(step())
+    monkeypatch.setattr(process, 'version', version)
+    assert process.digest_of(step()) == process.digest_of(step()) != installed
+
+
+def test_steps_depend_on_the_rig_file_whose_defaults_they_use(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    study = Fake(path=tmp_path / 'study.toml')
+
+    def digest():
+        words = ['walk.csv', '--calibration', 'result']
+        make = process._StepMaker(study, parse_words)
+        return process.digest_of(make('walk', 'reconstruct', {}, words, Path('points.csv')))
+
+    without = digest()
+    (tmp_path / 'rig.toml').write_text('units = "cm"')
+    first = digest()
+    assert first == digest() != without
+    (tmp_path / 'rig.toml').write_text('units = "mm"  # not cm')
+    assert digest() not in (without, first)

@@ -78,6 +78,8 @@ READ_A_BAG = {
     'survey': ['bag', '--phantom', 'p.csv', '--out', 'o.csv'],
     'orient': ['bag', '--phantom', 'p.csv', '--calibration', 'c'],
     'reconstruct': ['bag', '--calibration', 'c', '--out', 'o.csv'],
+    'bodies': ['bag', '--bodies', 'b.csv', '--calibration', 'c', '--out', 'o'],
+    'heal': ['bag', '--calibration', 'c', '--out', 'o'],
     'convert': ['bag', '--to', 'observations', '--out', 'o.csv'],
 }
 

@@ -6,6 +6,7 @@
 import csv
 import json
 import pathlib
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -573,6 +574,24 @@ def test_calibrate_writes_an_orientation(folder, tmp_path, capsys):
         in capsys.readouterr().err
     )
     assert not (tmp_path / 'apart' / 'rig_orientation.npz').exists()
+
+
+def test_orient_keeps_the_orientation_that_a_doubtful_one_replaces(folder, tmp_path):
+    result = tmp_path / 'result'
+    shutil.copytree(folder / 'result', result)
+    path = result / 'rig_orientation.npz'
+    previous = result / 'rig_orientation.npz.previous'
+    orient = ('--phantom', folder / 'phantom.csv', '--calibration', result)
+    assert run('orient', folder / 'capture', *orient) == 0
+    good = path.read_bytes()
+    frames = capture(count=1)
+    (frame,) = frames['b']
+    uv = frame.uv.copy()
+    uv[::3] += np.random.default_rng(1).normal(0, 6, uv[::3].shape)
+    write_bag(tmp_path / 'doubtful', {**frames, 'b': [replace(frame, uv=uv)]})
+    for more, status in ((), 3), (('--exit-zero',), 0):
+        assert run('orient', tmp_path / 'doubtful', *orient, *more) == status
+        assert path.read_bytes() != good == previous.read_bytes()
 
 
 def test_orient_and_reconstruct(folder, tmp_path, capsys):

@@ -298,7 +298,7 @@ class BridgeNode(ParameterNode):
         for topic in self._topics_of_graph.new():
             definition = topic.definition
             schema = self._foxglove.Schema(
-                name=topic.type, encoding=definition.encoding, data=definition.text.encode()
+                name=topic.type_name, encoding=definition.encoding, data=definition.text.encode()
             )
             channel = self._foxglove.Channel(topic.name, schema=schema, message_encoding='cdr')
             self._shown[topic.name] = _Shown(topic.name, topic.kind, channel)

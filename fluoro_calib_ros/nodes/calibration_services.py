@@ -122,9 +122,7 @@ class OrientationService(RigServices):
         check_timeout(timeout)
         most = self._rig.settings().limits.max_exposures
         if request.frames > most:
-            raise DataError(
-                f'frames must be at most {most} (parameter max_exposures), not {request.frames}'
-            )
+            raise DataError(f'frames must be at most {most} (max_exposures), not {request.frames}')
         if not self._node.readers:
             raise DataError(NOT_ACTIVE)
         missing = [name for name in names if name not in self._output.calibrations]

@@ -37,7 +37,6 @@ from .runtime.topics import (
     DISCOVERY_S,
     PublishedTopic,
     TopicDiscovery,
-    adaptation_message,
     adapted_qos,
     received_by_all,
 )
@@ -149,7 +148,7 @@ class RecorderNode(ParameterNode):
         is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         entry = TopicToRecord(
             topic,
-            published.type,
+            published.type_name,
             [qos_document(publisher.qos_profile) for publisher in published.publishers],
             published.definition,
             latched_count(published.publishers) if is_latched else 0,
@@ -170,7 +169,7 @@ class RecorderNode(ParameterNode):
                 self._limited_logger.error(self._loss())
 
         self._reader.subscribe(published.kind, topic, on_message, qos, decode=lambda data: data)
-        self.get_logger().info(f'recording {topic} [{published.type}]')
+        self.get_logger().info(f'recording {topic} [{published.type_name}]')
 
     def _loss(self) -> str:
         """Return a message about dropped messages and the cause, '' if none was dropped."""
@@ -192,8 +191,7 @@ class RecorderNode(ParameterNode):
 
     def _on_timer(self) -> None:
         """Adapt subscriptions to publishers that have restarted; publish the diagnostics."""
-        for topic, qos in self._reader.adapt().items():
-            self.get_logger().warning(adaptation_message(topic, qos))
+        self._reader.adapt()
         recording = self._recording
         if recording.fault:
             self._limited_logger.error(recording.fault)

@@ -9,13 +9,16 @@ import re
 import socket
 import struct
 import sys
-from contextlib import ExitStack
+import threading
+from contextlib import ExitStack, suppress
 
 import pytest
 from fluoro_calib_msgs.msg import CalibrationStatus
 from geometry_msgs.msg import TransformStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from ros_graph import NAMES, Process, entry_point
+from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from fluoro_calib_ros.nodes.runtime.topics import latched_qos
@@ -98,6 +101,38 @@ def test_every_client_receives_the_last_message_of_each_publisher_of_a_latched_t
             foxglove = Foxglove(sockets.enter_context(connected(graph, bridge)), topic)
             messages = [deserialize_message(foxglove.receive(), TFMessage) for _ in frames]
             assert {m.transforms[0].child_frame_id for m in messages} == set(frames)
+
+
+def test_publisher_that_restarts_with_best_effort_is_shown(graph):
+    from websockets.exceptions import ConnectionClosed
+
+    client = graph.client
+    topic = f'{graph.namespace}/note'
+    received = []
+    bridge = graph.start('bridge_node', {'port': 0, 'topics': f'[{topic}]'})
+    with connected(graph, bridge) as socket:
+        foxglove = Foxglove(socket, topic)
+
+        def receive():
+            with suppress(ConnectionClosed):
+                while True:
+                    received.append(foxglove.receive())
+
+        thread = threading.Thread(target=receive)
+        thread.start()
+        for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT):
+            publisher = client.create_publisher(
+                String, topic, QoSProfile(depth=10, reliability=reliability)
+            )
+            received.clear()
+
+            def shown(publisher=publisher):
+                publisher.publish(String(data='x'))
+                return received
+
+            client.wait_until(shown, what='a message')
+            client.destroy_publisher(publisher)
+    thread.join()
 
 
 def test_only_who_knows_the_token_and_no_foreign_page_is_let_through(graph):

@@ -136,7 +136,7 @@ def test_page_shows_what_the_rig_sees_and_has_measured(graph, calibrated, exposu
         assert {len(row) for row in space['points']} == {5}
         assert np.abs(np.array(space['points'])[:, 1:4]).max() < 2000
         client.end_stream()
-        # The page asks the calibration node for its folder once a second.
+        # The calibration node reports its folder once a second.
         client.wait_until(
             lambda: browser.open('/residuals')[0] == 200, what='the folder of the calibration'
         )

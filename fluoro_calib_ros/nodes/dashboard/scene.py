@@ -9,6 +9,7 @@ import base64
 import math
 import time
 from collections import OrderedDict
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -89,7 +90,7 @@ class Scene:
         has_images = self._take_image(name, film)
         depth = OBSERVATION_DEPTH if has_images else 1  # 3 s at 30 Hz
         for message in self._taken(f'{name}/target_observations', TargetObservations, depth):
-            if not _has_rows(message, 'target_id', 'u', 'v'):  # the nodes report it
+            if not _has_rows(message, ('target_id', 'u', 'v')):  # the nodes report it
                 continue
             stamp_ns = nanoseconds_from_stamp(message.header.stamp)
             remember(film.points, stamp_ns, message, OBSERVATION_DEPTH)
@@ -156,7 +157,7 @@ class Scene:
             with suppress(ValueError):  # the reconstruction node reports the reason
                 out['sources'] = _sources(orientation_from_message(orientation))
         points = self._last('reconstruction/points_with_covariance', ReconstructedPoints)
-        if points is not None and _has_rows(points, 'target_id', 'x', 'y', 'z', 'status'):
+        if points is not None and _has_rows(points, ('target_id', 'x', 'y', 'z', 'status')):
             xyz = 1000 * np.column_stack([points.x, points.y, points.z])
             seen = np.atleast_1d(np.isfinite(xyz).all(axis=1))
             rows = zip(points.target_id, xyz.round(3).tolist(), points.status, seen.tolist())
@@ -225,7 +226,7 @@ def _shown(film: _Film) -> int:
     return max((stamp for stamp in film.images if stamp <= last), default=newest)
 
 
-def _has_rows(message: Any, *columns: str) -> bool:
+def _has_rows(message: Any, columns: Iterable[str]) -> bool:
     """Return whether the arrays of a message have the same length."""
     return len({len(getattr(message, column)) for column in columns}) == 1
 

@@ -37,17 +37,18 @@ from .diagnostics import (
 )
 from .parameters import ParameterNode
 from .streams import FaultHandlers, StreamReader
-from .topics import adaptation_message, publisher_conflict, qos_overrides
+from .topics import publisher_conflict, qos_overrides
 
 T = TypeVar('T')
+Step = Callable[[], None]
 
 
 class ManagedNode(ParameterNode, LifecycleNode):
     """Lifecycle node that configures and activates itself, unless autostart is false.
 
     Subclasses override configure(), activate(), deactivate() and cleanup(). The last two must work
-    in every state. A transition that raises is logged, which rclpy would not do, and undone; if
-    one of the last two raises, everything is cleaned up.
+    in every state. A transition that raises is logged, which rclpy would not do, and undone; after
+    a failed deactivate() or cleanup(), everything is cleaned up.
     """
 
     def __init__(self, name: str) -> None:
@@ -118,18 +119,14 @@ class ManagedNode(ParameterNode, LifecycleNode):
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Clean up after a transition that could not be undone; the node is unconfigured then."""
-        self._try(self.cleanup)
-        return TransitionCallbackReturn.SUCCESS
+        return self._try(self.cleanup)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Deactivate and clean up."""
         self.stop()
         return TransitionCallbackReturn.SUCCESS
 
-    def _try(
-        self, function: Callable[[], None], undo: Callable[[], None] | None = None
-    ) -> TransitionCallbackReturn:
-        """Run a function; if it raises, log that and undo it, or report an error."""
+    def _try(self, function: Step, undo: Step | None = None) -> TransitionCallbackReturn:
         try:
             function()
         except Exception as error:
@@ -225,8 +222,7 @@ class StreamNode(ManagedNode):
         """Return a message for every topic with an incompatible publisher, and log them."""
         messages: dict[str, str] = {}
         for reader in self.readers:
-            for topic, qos in reader.adapt().items():
-                self.get_logger().warning(adaptation_message(topic, qos))
+            reader.adapt()
             messages.update(reader.incompatible_publishers())
         for message in messages.values():
             self.limited_logger.warning(message)
@@ -263,9 +259,8 @@ class StreamNode(ManagedNode):
         if not topics:
             return
         missing = [topic for topic, published in topics.items() if not published]
-        state = f'receiving {", ".join(topics)}'
-        if missing:
-            state = f'waiting for a publisher of {", ".join(missing)}'
+        lead, names = ('waiting for a publisher of', missing) if missing else ('receiving', topics)
+        state = f'{lead} {", ".join(names)}'
         if state != self._readiness:
             self._readiness = state
             self.get_logger().info(f'ready: {state}')
@@ -364,8 +359,7 @@ def lost_messages(state: InputState) -> Health | None:
 
 def incompatible_publisher(state: InputState) -> Health | None:
     """Warn if a publisher offers less than is requested."""
-    messages = [state.incompatible[topic] for topic in state.topics if topic in state.incompatible]
-    return warning(messages[0] if messages else '')
+    return warning(next(filter(None, map(state.incompatible.get, state.topics)), ''))
 
 
 def inactive_node(state: InputState) -> Health | None:

@@ -42,6 +42,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from ...limits import read_limits
 from .topics import (
     OBSERVATION_DEPTH,
+    adaptation_message,
     differs,
     incompatible_qos_message,
     qos_overrides,
@@ -214,11 +215,10 @@ class StreamReader:
             for route in self._routes
         }
 
-    def adapt(self) -> dict[str, QoSProfile]:
-        """Renew subscriptions whose publishers offer something else than before.
+    def adapt(self) -> None:
+        """Renew subscriptions whose publishers offer something else than before, and log that.
 
-        Returns the new profiles by topic. To be called from the thread that created the
-        subscriptions.
+        To be called from the thread that created the subscriptions.
         """
         renewed = {}
         for number, (_, subscription, *_, is_overridden) in enumerate(self._routes):
@@ -227,7 +227,7 @@ class StreamReader:
             if differs(qos, subscription.qos_profile) and not is_overridden:
                 renewed[number] = qos
         if not renewed:
-            return {}
+            return
         self._halt()
         for number, qos in renewed.items():
             route = self._routes[number]
@@ -236,8 +236,8 @@ class StreamReader:
             self._sequence.pop(route.topic, None)
             new = self._subscription(route.subscription.msg_type, route.topic, qos)
             self._routes[number] = route._replace(subscription=new)
+            self._node.get_logger().warning(adaptation_message(route.topic, qos))
         self.start()
-        return {self._routes[number].topic: qos for number, qos in renewed.items()}
 
     def incompatible_publishers(self) -> dict[str, str]:
         """Return a message for every topic with a publisher that offers less than is requested.

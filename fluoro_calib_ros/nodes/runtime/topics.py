@@ -79,8 +79,8 @@ class PublishedTopic(NamedTuple):
     """A topic of the graph that can be received."""
 
     name: str
-    type: str  #: name of the message type
-    kind: type[Any]  #: class of the message type
+    type_name: str
+    kind: type[Any]  #: class of the messages
     definition: Definition
     publishers: Sequence[TopicEndpointInfo]
 

@@ -31,8 +31,6 @@ from ...errors import DataError
 from ...exposures.phantom import first_repeated
 from ...photogrammetry.rotations import (
     ROTATION_TOLERANCE,
-    TAKEN_TOLERANCE,
-    is_rotation,
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
@@ -49,6 +47,7 @@ from .content import (
     from_units,
     homogeneous,
     in_units,
+    pose_parts,
 )
 from .tables import (
     Row,
@@ -78,14 +77,13 @@ def _read_xmalab(path: Path, settings: FileSettings) -> Content:
     frame = ascending_frames(rows, first_column)
     values = np.array([row.numbers_or_nan(first_column) for row in rows])
     matrices = values.reshape(len(rows), len(names), 4, 4).transpose(0, 1, 3, 2)
-    for row, row_matrices in zip(rows, matrices):
-        _check(row, row_matrices, names)
-    missing = np.isnan(matrices).any(axis=(2, 3))
-    rotation = matrices[..., :3, :3].copy()
-    translation = from_units(matrices[..., :3, 3], mm)
-    rotation[missing] = np.nan
-    translation[missing] = np.nan
-    return Content(bodies=Bodies(tuple(names), frame, rotation, translation))
+    rotation, translation, is_invalid = pose_parts(matrices)
+    for row, column in np.argwhere(is_invalid):
+        rows[row].fail(f'the matrix of {names[column]} is not a rotation')
+    is_other = (matrices[..., 3, :] != [0, 0, 0, 1]).any(axis=2) & ~np.isnan(translation[..., 0])
+    for row, column in np.argwhere(is_other):
+        rows[row].fail(f'the columns 01, 02, 03 and 1 of {names[column]} are not 0, 0, 0 and 1')
+    return Content(bodies=Bodies(tuple(names), frame, rotation, from_units(translation, mm)))
 
 
 def _bodies(row: Row, first: int) -> list[str]:
@@ -105,17 +103,6 @@ def _bodies(row: Row, first: int) -> list[str]:
                 row.fail(f'the column {cell!r} should be {name!r}')
         names.append(match['body'] + (match['filter'] or ''))
     return names
-
-
-def _check(row: Row, matrices: NDArray[np.float64], names: list[str]) -> None:
-    """Raise DataError for a matrix (4, 4) that is not a pose."""
-    for name, matrix in zip(names, matrices):
-        if np.isnan(matrix).any():
-            continue
-        if not is_rotation(matrix[:3, :3], TAKEN_TOLERANCE):
-            row.fail(f'the matrix of {name} is not a rotation')
-        if (matrix[3] != [0, 0, 0, 1]).any():
-            row.fail(f'the columns 01, 02, 03 and 1 of {name} are not 0, 0, 0 and 1')
 
 
 def _write_xmalab(path: Path, content: Content, settings: FileSettings) -> Written:

@@ -159,6 +159,21 @@ class Bodies:
     rate_hz: float | None = None  #: frames per second; None if unknown
 
 
+def pose_parts(
+    matrices: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Split 4 x 4 matrices (m, b, 4, 4), one of which is missing if it has a NaN.
+
+    Returns rotations (m, b, 3, 3) and translations (m, b, 3), NaN where missing, and a mask (m, b)
+    of matrices that are not rotations.
+    """
+    missing = np.asarray(np.isnan(matrices).any(axis=(2, 3)))[..., None, None]
+    known = np.where(missing, np.eye(4), matrices)
+    is_invalid = ~is_rotation(known[..., :3, :3], TAKEN_TOLERANCE)
+    parts = np.where(missing, np.nan, matrices)
+    return parts[..., :3, :3], parts[..., :3, 3], is_invalid
+
+
 def homogeneous(bodies: Bodies, mm: float = 1.0) -> NDArray[np.float64]:
     """Return the poses of bodies as matrices (m, b, 4, 4), lengths in units of mm."""
     matrices = np.zeros((*bodies.rotation.shape[:2], 4, 4))

@@ -32,7 +32,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...photogrammetry.rotations import TAKEN_TOLERANCE, is_rotation
 from ..access import atomic_file, read_bytes, read_text, write_bytes
 from ..csv_table import as_text
 from .content import (
@@ -48,6 +47,7 @@ from .content import (
     homogeneous,
     in_units,
     points_without_precision,
+    pose_parts,
 )
 from .reader_process import arrays_apart
 from .tables import (
@@ -128,24 +128,18 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
             f'{path}: {matrices.shape[1]} rotations, but {len(set(names))} different names'
         )
     mm = _unit(path, str(arrays['rotation_unit'] or arrays['unit']), settings)
-    rotation = matrices[..., :3, :3].copy()
-    translation = matrices[..., :3, 3] * mm
-    missing = np.isnan(matrices).any(axis=(2, 3))
-    known_rotation = np.where(missing[..., None, None], np.eye(3), rotation)
-    is_invalid = ~is_rotation(known_rotation, TAKEN_TOLERANCE)
+    rotation, translation, is_invalid = pose_parts(matrices)
     first_frame = int(arrays['first'])
     if is_invalid.any():
         row, column = np.argwhere(is_invalid)[0]
         raise DataError(
             f'{path}, frame {first_frame + row}: the matrix of {names[column]} is not a rotation'
         )
-    rotation[missing] = np.nan
-    translation[missing] = np.nan
     return Bodies(
         tuple(names),
         first_frame + np.arange(len(matrices)),
         rotation,
-        translation,
+        translation * mm,
         rate_hz=float(arrays['rotation_rate']),
     )
 

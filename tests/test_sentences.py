@@ -307,7 +307,7 @@ def in_one_folder_only():
         comparing,
         load_calibrations=mock.Mock(side_effect=[{'a': None, 'b': None}, {'a': None}]),
         compare_calibrations=mock.DEFAULT,
-        _distances=lambda _: {},
+        _scales=lambda *_: {},
     ):
         return comparing.compare_folders('one', 'two').findings[0]
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.angles import AngleOptions, JointAngles
-from ..exposures.pairing import PairingOptions
-from ..exposures.stamps import ExposureNumbers
+from ..exposures.stamps import NS_PER_S, ExposureNumbers
 from ..io.bags.mcap_file import METADATA, is_bag
 from ..io.bags.metadata import TARGET_OBSERVATIONS
 from ..io.bags.reader import angles_in, image_topics, images_of, topics_of
@@ -30,6 +29,10 @@ from ..io.image_reading import (
     open_images,
 )
 from ..io.recordings import read_dicom_header
+
+# Largest difference of the stamps of one exposure in a bag, below half of the frame interval: still
+# phantoms are filmed seconds apart, and clocks of cameras may differ.
+TOLERANCE_NS = NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ def open_sources(
     def images() -> Iterator[SourceImage]:
         exposure = 0
         of_files = 0  # number of images so far that are not of a bag
-        by_stamp = ExposureNumbers(names, PairingOptions().tolerance_ns)
+        by_stamp = ExposureNumbers(names, TOLERANCE_NS)
         for path, (_, read), number in zip(files, readers, numbers):
             video = image_suffix_of(path) in VIDEO_SUFFIXES
             for frame, (in_bag, place, image, angle) in enumerate(read(by_stamp)):

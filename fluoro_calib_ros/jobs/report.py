@@ -39,8 +39,7 @@ from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..report.html import ReportInput, report_html, residual_rows
-from ..report.rig_geometry import SpaceAccuracy, accuracy_in_space
-from .conversion import stations_of
+from ..report.rig_geometry import SpaceAccuracy, accuracy_in_space, phantom_distance
 from .reconstruction import ReconstructionOptions, reconstruct
 from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note
 
@@ -88,25 +87,24 @@ def compare_folders(first: PathLike, second: PathLike) -> ComparedFolders:
         name: compare_calibrations(first_calibrations[name], second_calibrations[name])
         for name in common
     }
-    distances = _distances(Path(first))
-    scales = {
-        n: distances[n] / float(first_calibrations[n].interior[2])
-        for n in common
-        if n in distances
-    }
+    scales = _scales(Path(first), {name: first_calibrations[name] for name in common})
     return ComparedFolders(comparisons, scales, tuple(findings))
 
 
-def _distances(directory: Path) -> dict[str, float]:
-    """Return the median distance of the phantom from the source, by fluoroscope [mm]."""
-    if not (directory / RESULT).exists():
-        return {}
-    distances: dict[str, list[float]] = {}
-    for station in stations_of(directory / RESULT):
-        distances.setdefault(station.fluoroscope, []).append(
-            float(np.linalg.norm(station.position_mm))
-        )
-    return {name: float(np.median(values)) for name, values in distances.items()}
+def _scales(directory: Path, calibrations: Calibrations) -> dict[str, float]:
+    """Return the size of a pixel at the phantom [mm], by fluoroscope of a result folder.
+
+    Raises DataError for a damaged result.json.
+    """
+    result = read_result(directory, RESULT)
+    try:
+        return {
+            name: phantom_distance(result, name) / float(calibration.interior[2])
+            for name, calibration in calibrations.items()
+            if name in result.get('fluoroscopes', ())
+        }
+    except NOT_A_RESULT as error:
+        raise _not_a_result(directory, error) from None
 
 
 # Exceptions raised by reading a damaged result.

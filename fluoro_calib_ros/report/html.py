@@ -171,7 +171,7 @@ def _check_mm(report: ReportInput, check: Mapping[str, Any]) -> float | None:
 
 def _mm_per_px(report: ReportInput, name: str) -> float:
     """Return the size of a pixel at the median distance of the phantom [mm]."""
-    distance = phantom_distance(report.result['fluoroscopes'][name]['exposures'])
+    distance = phantom_distance(report.result, name)
     return distance / float(report.calibrations[name].interior[2])
 
 
@@ -298,7 +298,7 @@ def _fluoroscope(report: ReportInput, name: str, residuals: Residuals) -> dict[s
             for number, *statistics in residuals.of_exposures()
         ],
         'mm_per_px': _mm_per_px(report, name),
-        'distance_mm': phantom_distance(report.result['fluoroscopes'][name]['exposures']),
+        'distance_mm': phantom_distance(report.result, name),
         'uncalibrated': uncalibrated_share(calibration),
     }
 

@@ -101,17 +101,24 @@ def beams(orientation: RigOrientation) -> list[tuple[str, float, float]]:
     return pairs
 
 
-def phantom_in_sensor(entry: Mapping[str, Any]) -> NDArray[np.float64]:
-    """Return the origin of the phantom in the sensor frame for an exposure of result.json [mm]."""
-    rotation = matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float))
-    return -rotation @ np.array(entry['position_mm'], dtype=float)
+def phantom_in_sensor(result: Mapping[str, Any], name: str) -> NDArray[np.float64]:
+    """Return the centroids (m, 3) of the targets in the sensor frames of exposures [mm].
+
+    result: content of result.json. name: of a fluoroscope.
+    """
+    entries = result['fluoroscopes'][name]['exposures']
+    xyz = np.array([target['xyz_mm'] for target in result['targets']]).reshape(-1, 3)
+    centre = xyz.mean(axis=0) if len(xyz) else np.zeros(3)
+    quaternion = np.array([entry['quaternion_wxyz'] for entry in entries], dtype=float)
+    position = np.array([entry['position_mm'] for entry in entries], dtype=float)
+    rotation = matrix_from_quaternion(quaternion.reshape(-1, 4))
+    return (rotation @ (centre - position.reshape(-1, 3))[:, :, None])[:, :, 0]
 
 
-def phantom_distance(exposures: Sequence[Mapping[str, Any]]) -> float:
+def phantom_distance(result: Mapping[str, Any], name: str) -> float:
     """Return the median depth of the phantom from the source [mm], NaN without exposures."""
-    if not exposures:
-        return float('nan')
-    return float(np.median([phantom_in_sensor(entry)[2] for entry in exposures]))
+    depth = phantom_in_sensor(result, name)[:, 2]
+    return float(np.median(depth)) if len(depth) else float('nan')
 
 
 def uncalibrated_share(calibration: FluoroscopeCalibration) -> float:
@@ -141,8 +148,8 @@ def drawing(
             index = orientation.fluoroscopes.index(name)
             rotation = orientation.rotation[index]
             origin = orientation.position_mm[index]
-        exposures = entries[name]['exposures']
-        depth = BEHIND * (phantom_distance(exposures) if exposures else 1000.0)
+        distance = phantom_distance(result, name)
+        depth = BEHIND * (distance if np.isfinite(distance) else 1000.0)
         xp, yp, c = calibration.interior
         width, height = calibration.image_size
         corners = [(0, 0), (width, 0), (width, height), (0, height)]
@@ -155,7 +162,5 @@ def drawing(
             }
         )
         if not places:
-            places = [
-                (rotation.T @ phantom_in_sensor(entry) + origin).tolist() for entry in exposures
-            ]
+            places = (phantom_in_sensor(result, name) @ rotation + origin).tolist()
     return {'fluoroscopes': fluoroscopes, 'places': places}

@@ -165,14 +165,16 @@ def test_bags_and_result_folders_are_told_by_what_they_hold(folder, source):
         assert is_image_bag(path) == source.startswith(('radiographs', 'both'))
 
 
-def test_images_of_a_bag_are_numbered_by_stamp(tmp_path):
+@pytest.mark.parametrize('late_ns', [0, 300_000_000])
+def test_images_of_a_bag_are_numbered_by_stamp(tmp_path, late_ns):
     """A lost image of one fluoroscope shifts no exposure, also in further bags; as live."""
     header = message_class('std_msgs/msg/Header')
     time = message_class('builtin_interfaces/msg/Time')
 
     def write(bag, name, moment, stamp):
         pixels = np.full(4, moment, np.uint8)
-        image = message_class(IMAGE)(header(time(stamp, 0), ''), 2, 2, 'mono8', 0, 2, pixels)
+        stamp = time(stamp, late_ns * (name == 'b'))
+        image = message_class(IMAGE)(header(stamp, ''), 2, 2, 'mono8', 0, 2, pixels)
         bag.write(f'/{name}/image_raw', IMAGE, image, 10**9 * moment + (name == 'b'))
 
     for number in (0, 1):

@@ -387,16 +387,24 @@ def test_arrows_of_a_comparison_are_as_long_as_their_cells():
 # ---- the rig in mm
 
 
-def entry(distance):
-    return {'exposure': 1, 'quaternion_wxyz': [1, 0, 0, 0], 'position_mm': [5, -7, -distance]}
+def result_of(*distances, centre=(0.0, 0.0, 0.0)):
+    """A result with exposures of a at distances, whose phantom has its centroid at centre."""
+    entries = [
+        {'quaternion_wxyz': [1, 0, 0, 0], 'position_mm': [5, -7, -distance]}
+        for distance in distances
+    ]
+    targets = [{'xyz_mm': np.add(centre, side)} for side in ([1, 2, 3], [-1, -2, -3])]
+    return {'fluoroscopes': {'a': {'exposures': entries}}, 'targets': targets}
 
 
 def test_distances_of_the_phantom_are_along_the_axis():
-    assert phantom_in_sensor(entry(900.0)).tolist() == [-5, 7, 900]
-    half = {'quaternion_wxyz': [0, 1, 0, 0], 'position_mm': [1, 2, 3]}  # half a turn about x
-    np.testing.assert_allclose(phantom_in_sensor(half), [-1, 2, 3], atol=1e-12)
-    assert phantom_distance([entry(800.0), entry(1000.0), entry(1900.0)]) == 1000
-    assert np.isnan(phantom_distance([]))
+    assert phantom_in_sensor(result_of(900.0), 'a').tolist() == [[-5, 7, 900]]
+    half = result_of(900.0, centre=(1.0, 2, 3))
+    half['fluoroscopes']['a']['exposures'][0] |= {'quaternion_wxyz': [0, 1, 0, 0]}  # about x
+    np.testing.assert_allclose(phantom_in_sensor(half, 'a'), [[-4, -9, -903]], atol=1e-12)
+    assert phantom_distance(result_of(800.0, 1000.0, 1900.0), 'a') == 1000
+    assert phantom_distance(result_of(800.0, centre=(0, 0, 200.0)), 'a') == 1000
+    assert np.isnan(phantom_distance(result_of(), 'a'))
 
 
 def test_beams_meet_at_their_angle():
@@ -427,7 +435,7 @@ def test_share_of_the_image_that_is_not_calibrated():
 def test_drawing_of_a_rig_is_in_its_frame():
     calibration = rigs.pincushion('a', SIZE)
     calibration = replace(calibration, interior=np.array([160.0, 80, 1000]))
-    result = {'fluoroscopes': {'a': {'exposures': [entry(900.0)]}}}
+    result = result_of(900.0)
     alone = drawing(result, {'a': calibration}, None)
     (one,) = alone['fluoroscopes']
     depth = 1.3 * 900
@@ -485,7 +493,7 @@ def given(**changes):
     calibration = replace(rigs.pincushion('a', SIZE), interior=np.array([160.0, 80, 1000]))
     values = {
         'calibrations': {'a': calibration},
-        'result': {'fluoroscopes': {'a': {'exposures': [entry(800.0)]}}, 'targets': []},
+        'result': result_of(800.0) | {'targets': []},
         'names': Names(),
     }
     return Fake(**{**values, **changes})

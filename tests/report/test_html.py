@@ -263,7 +263,7 @@ def test_first_screen_is_in_mm(tmp_path, text_only):
     for name, calibration in given.calibrations.items():
         entry = given.result['fluoroscopes'][name]
         true = np.median([np.linalg.norm(e['position_mm']) for e in entry['exposures']])
-        distance = phantom_distance(entry['exposures'])
+        distance = phantom_distance(given.result, name)
         assert distance == pytest.approx(true, rel=0.02)
         width = calibration.image_size[0] * distance / calibration.interior[2]
         assert f'{width:.0f} ×' in text
@@ -276,7 +276,7 @@ def test_checks_have_their_sentence_and_mm(folder, tmp_path, text_only):
     write_verdict(copy, 'fail', 'two halves differ')
     given = read_report_input(copy)
     (check,) = html_report._verdict(given)['checks']
-    distance = phantom_distance(given.result['fluoroscopes']['a']['exposures'])
+    distance = phantom_distance(given.result, 'a')
     assert check['mm'] == pytest.approx(2.0 * distance / given.calibrations['a'].interior[2])
     assert check['sentence'] == 'two halves differ'
 

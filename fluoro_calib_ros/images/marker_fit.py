@@ -188,15 +188,6 @@ class _MarkerFit(ShadowFit):
         members = np.concatenate([rows[:, None], near], axis=1)
         shadow, by_u, by_v = self._shadow(members, self.middle[rows])
         direct = self.background.direct(rows)
-        if not near.shape[1]:  # the same in fewer operations
-            depth = self.depth[rows, None]
-            behind = direct * np.maximum(1 - depth * shadow[:, 0], MIN_PASSED)
-            jacobian = self._jacobian(rows, behind, 1)
-            by_place = -direct * depth
-            np.multiply(by_place, by_u[:, 0], out=jacobian[:, TERMS])
-            np.multiply(by_place, by_v[:, 0], out=jacobian[:, TERMS + 1])
-            np.multiply(-direct, shadow[:, 0], out=jacobian[:, TERMS + 2])
-            return self.background.scattered(rows) + behind, jacobian
         exists = members >= 0
         depth = np.where(exists, self.depth[members], 0.0)[..., None]
         passed = np.maximum(1 - depth * shadow, MIN_PASSED)

@@ -362,9 +362,13 @@ def one_core() -> Iterator[None]:
     import cv2
     from threadpoolctl import threadpool_limits
 
+    threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    with threadpool_limits(1):
-        yield
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        cv2.setNumThreads(threads)
 
 
 @contextmanager

@@ -58,15 +58,9 @@ def with_given_interior(evidence: Evidence, checks: Sequence[Check]) -> list[Che
     The estimated noise can absorb the misfit, so that no other check fails. Checks that do fail
     then get the advice to repair the interior orientation first.
     """
-    request = evidence.request
-    distance = request.principal_distance
-    if request.options.interior_sd is None or distance is None:
-        return list(checks)
     contradictions: list[Check] = []
-    for names in request.groups:
-        names = tuple(name for name in names if name not in request.known_orientations)
-        if names:
-            contradictions += _contradictions(evidence, names, distance)
+    for names in _given_groups(evidence.request):
+        contradictions += _contradictions(evidence, names)
     if not contradictions:
         return list(checks)
     contradicted = {'', *(check.place.fluoroscope for check in contradictions)}
@@ -79,23 +73,34 @@ def with_given_interior(evidence: Evidence, checks: Sequence[Check]) -> list[Che
     return [*contradictions, *remaining]
 
 
-def _contradictions(evidence: Evidence, names: Sequence[str], distance: float) -> list[Check]:
+def _given_groups(request: CalibrationRequest) -> list[tuple[str, ...]]:
+    """Return the fluoroscopes of each adjustment to which an interior orientation is given."""
+    if request.options.interior_sd is None or request.principal_distance is None:
+        return []
+    known = request.known_orientations
+    groups = (tuple(name for name in names if name not in known) for names in request.groups)
+    return [names for names in groups if names]
+
+
+def _contradictions(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     """Return a failed check for every fluoroscope whose exposures contradict the given values."""
     evidence.report_step(f'{"+".join(names)}: interior orientation without the given values')
     try:
         free = evidence.calibrate_free(names)
     except DataError:
         return []
-    checks = [_given_interior_check(evidence, name, free[name], distance) for name in names]
+    checks = [_given_interior_check(evidence, name, free[name]) for name in names]
     return [check for check in checks if check is not None]
 
 
 def _given_interior_check(
-    evidence: Evidence, name: str, free: FluoroscopeCalibration, distance: float
+    evidence: Evidence, name: str, free: FluoroscopeCalibration
 ) -> Check | None:
     calibration = evidence.calibrations[name]
     rmse, rmse_free = rms(calibration.rmse_after), rms(free.rmse_after)
     gain = rmse / rmse_free
+    distance = evidence.request.principal_distance
+    assert distance is not None
     given_interior = nominal_interior(calibration.image_size, distance)
     given_sd = np.asarray(evidence.request.options.interior_sd)
     sd = np.sqrt(np.diag(free.interior_covariance))
@@ -166,7 +171,7 @@ def validate(
     request = replace(request, frames=_used_frames(request.frames, result))
     groups = len(request.groups)
     count = sum(subject.steps * (1 if subject.of_rig else groups) for subject in SUBJECTS)
-    steps = _StepCounter(progress, 1 + count)
+    steps = _StepCounter(progress, 1 + count + len(_given_groups(request)))
     evidence = Evidence(request, calibrations, result, steps.report)
     steps.report('residuals and beads')
     checks = []

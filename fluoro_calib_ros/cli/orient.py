@@ -35,7 +35,7 @@ def exposure_numbers(text: str) -> set[int]:
             if not numbers or numbers[0] < 0 or len(numbers) > MAX_EXPOSURES:
                 raise ValueError
             exposures.update(numbers)
-    except ValueError:
+    except (ValueError, OverflowError):
         raise argparse.ArgumentTypeError(
             f'{text!r} is not a list of exposures, such as 1,4-6'
         ) from None

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
@@ -18,6 +19,7 @@ NAME = 'phantom'
 HELP = 'Write the phantom file of a regular sheet or block from its drawing, with a picture.'
 EXAMPLE = 'fluoro-calib phantom --hex 45x45 --pitch 7 --diameter 3 --blocked 10,12 sheet.csv'
 MAX_COUNT = 1000  # maximum number of places along an axis
+MAX_PLACES = 10**6
 PICTURES = ('.svg', '.png')
 
 
@@ -28,6 +30,8 @@ def counts(length: int) -> Callable[[str], tuple[int, ...]]:
         parts = text.lower().split('x')
         if len(parts) == length and all(part.isascii() and part.isdigit() for part in parts):
             values = tuple(map(int, parts))
+            if math.prod(values) > MAX_PLACES:
+                raise argparse.ArgumentTypeError(f'{text} has more than {MAX_PLACES} places')
             if all(1 <= value <= MAX_COUNT for value in values):
                 return values
         form = 'x'.join(['N'] * length)

@@ -57,7 +57,8 @@ from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
 
 BLOCKS = 10  # blocks of a recording, alternately used for the diagnosis and for its verdict
 MAX_EXPOSURES = 100  # maximum number used for each of these, evenly spread
-MIN_EXPOSURES = BLOCKS
+MIN_EXPOSURES = BLOCKS  # of the diagnosis, and of each half of its verdict
+MIN_RECORDED = 2 * MIN_EXPOSURES
 # Largest relative standard deviation (posterior over prior) of a direction of a change that the
 # data identify: beyond it, they have determined less than half of the change.
 IDENTIFIED = 0.5
@@ -227,8 +228,8 @@ def _check_seen(poses: Poses) -> None:
     count = int(poses.known.any(axis=1).sum())
     if count < MIN_EXPOSURES:
         raise DataError(
-            f'{count} of {len(poses.known)} exposures show three markers of a body in two views, '
-            f'{MIN_EXPOSURES} are needed'
+            f'{count} of {len(poses.known)} exposures, every second block of the recording, show '
+            f'three markers of a body in two views, {MIN_EXPOSURES} are needed'
         )
 
 
@@ -238,8 +239,8 @@ def _chosen(paired: Sequence[_Exposure]) -> tuple[list[_Exposure], list[_Exposur
     Raises DataError if there are too few.
     """
     count = len(paired)
-    if count < MIN_EXPOSURES:
-        raise DataError(f'{count} exposures have two views, {MIN_EXPOSURES} are needed')
+    if count < MIN_RECORDED:
+        raise DataError(f'{count} exposures have two views, {MIN_RECORDED} are needed')
     block = np.arange(count) * BLOCKS // count
     out = []
     for parity in (0, 1):

@@ -19,7 +19,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from ..bodies.body import Body
 from ..correction.angle_field import note_on_angles
@@ -35,6 +34,7 @@ from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.overlay import draw_markers
 from ..io.access import write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..processes import one_core
 from .extraction import Progress, make_picture_folder
 from .followers import MarkerFollower, MarkerSettings
 from .image_sources import (
@@ -237,8 +237,7 @@ def run_marker_extraction(
             make_picture_folder(request.overlay, name, request.sources[name])
     recording = _Recording(request)
     total = max(source.count for source in sources.values())
-    cv2.setNumThreads(1)
-    with threadpool_limits(1):
+    with one_core():
         for number, images in enumerate(_exposures(sources), 1):
             recording.add(images)
             if progress is not None:

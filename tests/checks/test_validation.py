@@ -110,7 +110,11 @@ def weighted(error, sd, strength=0.1):
     shown = of_rig.fluoroscopes[0].interior
     distance = (1 + error) * shown[2]
     request = CalibrationRequest(frames, of_rig.phantom, options, principal_distance=distance)
-    return validate(request, calibrate_request(request).calibrations), shown
+    steps = []
+    calibrations = calibrate_request(request).calibrations
+    validation = validate(request, calibrations, lambda *step: steps.append(step[1:]))
+    assert steps == [(done, len(steps)) for done in range(len(steps))]
+    return validation, shown
 
 
 def test_a_given_principal_distance_that_the_exposures_contradict_is_the_first_finding():

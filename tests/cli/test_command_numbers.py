@@ -66,7 +66,7 @@ def test_numbers_of_exposures_are_single_or_ranges(text, expected):
     assert exposure_numbers(text) == expected
 
 
-@pytest.mark.parametrize('text', ['', 'x', '6-4', '-1', '1-', '1,,2', f'0-{10**6}'])
+@pytest.mark.parametrize('text', ['', 'x', '6-4', '-1', '1-', '1,,2', f'0-{10**6}', f'0-{10**20}'])
 def test_lists_of_exposures_that_are_none_are_refused(text):
     if text == '1-':
         assert exposure_numbers(text) == {1}
@@ -96,6 +96,8 @@ def test_counts_of_places_are_within_their_limits(text, expected):
     if expected:
         assert convert_text(text) == expected
         return
+    with pytest.raises(argparse.ArgumentTypeError, match='1000000 places'):
+        phantom.counts(3)('1000x1000x1000')
     for one in (text, '3', '3x1001', '3x4x5', '3x-4'):
         with pytest.raises(argparse.ArgumentTypeError):
             convert_text(one)

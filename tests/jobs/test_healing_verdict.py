@@ -13,6 +13,7 @@ import pytest
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.checks.check import verdict_of
 from fluoro_calib_ros.cli.heal import _lines
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.healing.diagnosis import Cause, Change
 from fluoro_calib_ros.healing.rig_errors import RigErrors
 from fluoro_calib_ros.jobs import healing
@@ -142,3 +143,14 @@ def test_recording_that_three_changes_do_not_explain_does_not_pass():
     assert healing._unused(SimpleNamespace(changes=SOFT, complete=True), 1, rig).passed
     found.complete = True
     assert healing._sure(found, rig).passed
+
+
+def test_exposures_that_suffice_are_counted_over_the_recording():
+    exposures = [{'a': n, 'b': n} for n in range(20)]
+    used, unused = healing._chosen(exposures)
+    assert len(used) == len(unused) == 10
+    with pytest.raises(DataError, match='19 exposures have two views, 20 are needed'):
+        healing._chosen(exposures[:19])
+    few = SimpleNamespace(known=np.arange(10)[:, None] < 9)
+    with pytest.raises(DataError, match='9 of 10 exposures, every second block of the recording'):
+        healing._check_seen(few)

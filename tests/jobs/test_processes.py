@@ -15,7 +15,13 @@ import pytest
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.limits import ReadLimits, read_limits, use_read_limits
-from fluoro_calib_ros.processes import ProcessEnded, Resources, WorkerProcess, run_module
+from fluoro_calib_ros.processes import (
+    ProcessEnded,
+    Resources,
+    WorkerProcess,
+    one_core,
+    run_module,
+)
 
 
 class OwnError(Exception):
@@ -123,3 +129,12 @@ def test_a_module_that_takes_too_long_is_ended():
         run_module('http.server', '0', timeout_s=0.2)
     done = run_module('fluoro_calib_ros.io.formats.reader_process', 'c3d', '/no.c3d', timeout_s=60)
     assert done.returncode == 1 and done.stderr
+
+
+def test_libraries_have_their_threads_again_after_work_on_one_core():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    with one_core():
+        assert cv2.getNumThreads() == 1
+    assert cv2.getNumThreads() == 2
+    cv2.setNumThreads(before)

@@ -9,7 +9,7 @@ import argparse
 import contextlib
 import difflib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -37,13 +37,12 @@ from . import (
     watch,
 )
 from .arguments import add_read_limits, options_of
-from .output import print_status, styled, terminated_by_signals
+from .output import NOT_PASSED, print_status, styled, terminated_by_signals
 from .rig import add_rig, find_rig
 
 if TYPE_CHECKING:
     from ..io.rig_file import RigFile
 
-NOT_PASSED = 3  # exit status
 # A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, if its
 # arguments depend on each other, check(arguments, error). A command that gives a verdict has
 # --exit-zero, and its run returns whether the verdict is pass.
@@ -87,41 +86,39 @@ class _Parser(argparse.ArgumentParser):
 
     def format_usage(self) -> str:
         """Return the usage without the groups of RARE."""
-        formatter = self._get_formatter()
-        self._add_usage(formatter)
-        return formatter.format_help()
+        with self._short():
+            return super().format_usage()
 
     def format_help(self) -> str:
         """Return the help without the groups of RARE."""
-        formatter = self._get_formatter()
-        self._add_usage(formatter)
-        formatter.add_text(self.description)
-        for group in self._action_groups:
-            if group.title not in RARE:
-                formatter.start_section(group.title)
-                formatter.add_text(group.description)
-                formatter.add_arguments(group._group_actions)
-                formatter.end_section()
-        hidden = [group for group in self._action_groups if group.title in RARE]
+        with self._short() as hidden:
+            text = super().format_help()
+        end = self._get_formatter()
         if hidden:
             count = sum(len(group._group_actions) for group in hidden)
             titles = ', '.join(str(group.title) for group in hidden)
-            formatter.add_text(f'--help-all shows {count} more options: {titles}')
-        formatter.add_text(self.epilog)
-        return formatter.format_help()
+            end.add_text(f'--help-all shows {count} more options: {titles}')
+        end.add_text(self.epilog)
+        return '\n'.join(filter(None, [text, end.format_help()]))
 
-    def _add_usage(self, formatter: argparse.HelpFormatter) -> None:
-        """Add the usage without the groups of RARE."""
-        rare = [
-            a for group in self._action_groups if group.title in RARE for a in group._group_actions
-        ]
-        visible_actions = [action for action in self._actions if action not in rare]
-        exclusive = [
+    @contextlib.contextmanager
+    def _short(self) -> Iterator[list[argparse._ArgumentGroup]]:
+        """Leave out the groups of RARE, which are yielded, and the epilog."""
+        whole = vars(self).copy()
+        hidden = [group for group in self._action_groups if group.title in RARE]
+        rare = [action for group in hidden for action in group._group_actions]
+        self._action_groups = [group for group in self._action_groups if group not in hidden]
+        self._actions = [action for action in self._actions if action not in rare]
+        self._mutually_exclusive_groups = [
             group
             for group in self._mutually_exclusive_groups
             if not any(action in rare for action in group._group_actions)
         ]
-        formatter.add_usage(self.usage, visible_actions, exclusive)
+        self.epilog = None
+        try:
+            yield hidden
+        finally:
+            vars(self).update(whole)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         try:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 # Escape sequences (ECMA-48, select graphic rendition).
 STYLES = {'red': '31;1', 'green': '32;1', 'yellow': '33', 'dim': '2'}
+NOT_PASSED = 3  # exit status of a command whose verdict is not pass
 VERDICTS = {'pass': 'green', 'fail': 'red', 'cannot tell': 'yellow'}
 
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import DataError, shortened
 from ..io.rig_file import STUDY
-from .output import print_result, print_status
+from .output import NOT_PASSED, print_result, print_status
 
 if TYPE_CHECKING:
     import subprocess
@@ -41,7 +41,6 @@ TABLE = 'trials.csv'
 LOG = 'log.txt'
 PROMPT = '$ '  # before a command in the log
 POLL_S = 0.05  # interval between polls of the running commands
-NOT_PASSED = 3  # exit status of a step whose verdict is not pass
 SOURCE = 'source'
 OF_PROCESS = ('out', 'calibration', 'json', 'help', 'help_all', SOURCE)
 WRONG_DRIFT = ('warn', 'error')

@@ -30,8 +30,8 @@ from ..io.image_reading import (
 )
 from ..io.recordings import read_dicom_header
 
-# Largest difference of the stamps of one exposure in a bag, below half of the frame interval: still
-# phantoms are filmed seconds apart, and clocks of cameras may differ.
+# Largest difference of the stamps of one exposure in a bag, below half of the frame interval:
+# still phantoms are filmed seconds apart, and clocks of cameras may differ.
 TOLERANCE_NS = NS_PER_S
 
 

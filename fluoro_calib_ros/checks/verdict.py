@@ -89,18 +89,18 @@ def _contradictions(evidence: Evidence, names: Sequence[str]) -> list[Check]:
         free = evidence.calibrate_free(names)
     except DataError:
         return []
-    checks = [_given_interior_check(evidence, name, free[name]) for name in names]
+    distance = evidence.request.principal_distance
+    assert distance is not None
+    checks = [_given_interior_check(evidence, name, free[name], distance) for name in names]
     return [check for check in checks if check is not None]
 
 
 def _given_interior_check(
-    evidence: Evidence, name: str, free: FluoroscopeCalibration
+    evidence: Evidence, name: str, free: FluoroscopeCalibration, distance: float
 ) -> Check | None:
     calibration = evidence.calibrations[name]
     rmse, rmse_free = rms(calibration.rmse_after), rms(free.rmse_after)
     gain = rmse / rmse_free
-    distance = evidence.request.principal_distance
-    assert distance is not None
     given_interior = nominal_interior(calibration.image_size, distance)
     given_sd = np.asarray(evidence.request.options.interior_sd)
     sd = np.sqrt(np.diag(free.interior_covariance))

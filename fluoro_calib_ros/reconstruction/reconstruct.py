@@ -293,8 +293,8 @@ def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigO
     names = [name for name in orientation.fluoroscopes if name in frames]
     if len(names) < 2:
         raise DataError(
-            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
-            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
+            f'there are image points of {", ".join(frames) or "none"}, but two fluoroscopes of '
+            f'the orientation ({", ".join(orientation.fluoroscopes)}) are needed'
         )
     return orientation.subset(names)
 

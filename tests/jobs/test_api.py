@@ -96,6 +96,9 @@ def test_no_fluoroscope_is_refused(calibrations):
     for job in (lambda: fc.calibrate({}, phantom), lambda: fc.adjust({}, phantom, calibrations)):
         with pytest.raises(fc.DataError, match='no frames of any fluoroscope'):
             job()
+    orientation = rigs.true_orientation(rigs.rig().fluoroscopes, calibrations)
+    with pytest.raises(fc.DataError, match='image points of none, but two'):
+        fc.reconstruct({}, calibrations, orientation)
 
 
 def test_adjust_refuses_numbers_that_calibrate_refuses(calibrations):

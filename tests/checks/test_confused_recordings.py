@@ -441,11 +441,13 @@ def distorted():
 
 def test_points_that_are_corrected_already_are_recognised():
     held, observed = distorted()
-    right = reconstruct(observed, held, orientation(), FROM_FILE)
+    ids = tuple(held[name].calibration_id for name in orientation().fluoroscopes)
+    of_held = replace(orientation(), calibration_ids=ids)
+    right = reconstruct(observed, held, of_held, FROM_FILE)
     assert right.widening < 2 and not right.lost_targets
     corrected = changed(lambda f: f)
     with refused(Kind.CORRECTED_ALREADY):
-        reconstruct(corrected, held, orientation(), FROM_FILE)
+        reconstruct(corrected, held, of_held, FROM_FILE)
 
 
 def with_ids_of_each_other(first, second):

@@ -40,6 +40,9 @@ EXAMPLE = (
     '--calibration result --out motion'
 )
 
+NO_TIMES = 'the file does not contain the times of its exposures; give their rate, --rate HZ'
+TIMES = 'the recording has the times of its exposures; --rate is for files without them'
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
@@ -102,7 +105,6 @@ def run(arguments: argparse.Namespace) -> bool:
 
     Returns whether the bodies are those of the recording, as far as the findings say.
     """
-    from ..io.bags.mcap_file import is_bag
     from ..io.bodies import read_bodies, read_joints
     from ..io.calibration import orientation_path
     from ..io.folder import check_output_folder
@@ -124,16 +126,8 @@ def run(arguments: argparse.Namespace) -> bool:
     joints = read_joints(arguments.joints, bodies) if arguments.joints else ()
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
-    if arguments.rate is None and not is_bag(arguments.source):
-        raise DataError(
-            f'{arguments.source}: the file does not contain the times of its exposures; give '
-            'their rate, --rate HZ'
-        )
-    if arguments.rate is not None and has_times(recording.frames):
-        raise DataError(
-            f'{arguments.source}: the recording has the times of its exposures; --rate is for '
-            'files without them'
-        )
+    if has_times(recording.frames) == (arguments.rate is not None):
+        raise DataError(f'{arguments.source}: {NO_TIMES if arguments.rate is None else TIMES}')
     neutral = None
     if arguments.neutral is not None:
         if not joints:
@@ -147,27 +141,13 @@ def run(arguments: argparse.Namespace) -> bool:
         rate=arguments.rate,
         neutral=neutral,
     )
+    observed = recording.frames, calibrations, orientation, bodies
     with ErrorsAt(arguments.source), ProgressBar('bodies', 'step') as bar:
-        outcome = track_bodies(
-            recording.frames,
-            calibrations,
-            orientation,
-            bodies,
-            joints=joints,
-            options=options,
-            progress=bar,
-        )
+        outcome = track_bodies(*observed, joints=joints, options=options, progress=bar)
     learned = None
     if arguments.learn:
         with ErrorsAt(arguments.source), ProgressBar('learned shapes', 'exposure') as bar:
-            learned = learn_shapes(
-                recording.frames,
-                calibrations,
-                orientation,
-                bodies,
-                options=options,
-                progress=bar,
-            )
+            learned = learn_shapes(*observed, options=options, progress=bar)
     with ProgressBar('film') as bar:
         film = None
         if arguments.film is not None:

@@ -15,7 +15,7 @@ from fluoro_calib_ros.checks.comparison import compare_calibrations
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.jobs.result_folder import save_result
-from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, matrix_from_vector
 
 NOISE_PX = 0.2
 PLACE = np.array([300.0, 700.0])
@@ -127,8 +127,11 @@ def test_compare_tells_what_changed(tmp_path, capsys):
     assert run(*arguments, '--figure', figure, '--json') == 0
     (entry,) = json.loads(capsys.readouterr().out)['fluoroscopes'].values()
     assert entry['field_changed'] is True
+    centre = base().targets.xyz_mm.mean(axis=0)
     exposures = base().fluoroscopes['a'].exposures
-    distance = np.median([np.linalg.norm(e.position_mm) for e in exposures])
+    turns = [matrix_from_quaternion(e.quaternion_wxyz) for e in exposures]
+    depths = [(t @ (centre - e.position_mm))[2] for t, e in zip(turns, exposures)]
+    distance = np.median(depths)
     scale = distance / calibration(1).interior[2]
     assert entry['rms_mm'] == pytest.approx(entry['rms_px'] * scale)
     assert figure.read_bytes().startswith(b'\x89PNG')

@@ -90,7 +90,7 @@ def test_markers_that_touch_are_where_they_are_without_noise(apart, motion):
         ways = (np.arange(8) - 3.5)[:, None] / 8 * motion
         light = light_behind(places, 5.0, 1.2, 0.9, ways)
     image = np.rint(light).astype(np.uint16)
-    windows = LightWindows(image, Fake(field=np.ones(image.shape, bool), inverted=False))
+    windows = LightWindows(image, Fake(field=np.ones(image.shape, bool), white=None))
     guess = MarkerGuess(
         places + [[0.4, -0.3], [-0.3, 0.3], [0.3, 0.3]],
         np.ones(3),

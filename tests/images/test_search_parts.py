@@ -462,7 +462,7 @@ def test_windows_of_light_end_at_the_border(inverted):
     field[3, 4] = False
     offset = np.array([[0, 0], [-1, 0], [1, 2]])
     for middle in ([[4, 3]], [[5, 3], [2, 2]], [[0, 0]], [[7, 5], [4, 3]], [[6, 3]], [[2, 4]]):
-        reader = LightWindows(image, Fake(field=field, inverted=inverted))
+        reader = LightWindows(image, Fake(field=field, white=255 if inverted else None))
         grey, valid = reader.read(np.array(middle), offset)
         for place, greys, valids in zip(np.array(middle), grey, valid):
             for (u, v), value, there in zip(place + offset, greys, valids):

@@ -473,7 +473,7 @@ def test_too_few_exposures_are_refused(rig, graph, learned):
     refused = client.result_of(answer)
     client.end_stream()
     assert refused.status == ABORTED
-    assert refused.result.message.endswith('two views, 10 are needed')
+    assert refused.result.message.endswith('two views, 20 are needed')
 
 
 def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, learned):

@@ -199,15 +199,17 @@ class StampTolerance:
 
 
 RECENT_IMAGES = 512  # number of exposures to which further images may be added
+MAX_MISSING = 10  # largest number of images in a row whose numbers are reserved
 
 
 class ExposureNumbers:
     """Assigns the same number to images of several fluoroscopes that belong to one exposure.
 
     Images are matched by stamp, within the tolerance [ns], which `StampTolerance` limits.
-    Exposures are counted from 1 in the order of their first image, so a lost image of any
-    fluoroscope does not shift the numbers. Images without a stamp (0) are counted for each
-    fluoroscope separately.
+    Exposures are counted from 1 in the order of time, so a lost image of any fluoroscope does not
+    shift the numbers. Where images of a film are missing, their numbers are reserved: other
+    fluoroscopes, whose images arrive later, may have them. Images without a stamp (0) are counted
+    for each fluoroscope separately.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], tolerance_ns: int) -> None:
@@ -215,6 +217,11 @@ class ExposureNumbers:
         # Stamp, number, and fluoroscopes whose image has arrived.
         self._recent: deque[tuple[int, int, set[str]]] = deque(maxlen=RECENT_IMAGES)
         self._last = 0
+        self._newest_ns = 0  # stamp of the exposure with the last number
+        self._latest: dict[str, int] = {}
+        self._steps: deque[int] = deque(maxlen=RECENT_STEPS)  # between images of a fluoroscope
+        # Expected stamps and numbers of exposures without an image so far.
+        self._reserved: deque[tuple[int, int]] = deque(maxlen=RECENT_IMAGES)
         self._without_stamp = dict.fromkeys(fluoroscopes, 0)
 
     def number(self, fluoroscope: str, stamp_ns: int) -> int:
@@ -231,9 +238,29 @@ class ExposureNumbers:
                 continue
             if nearest is None or offset <= abs(nearest[0] - stamp_ns):
                 nearest = exposure  # the newest of equally near ones, for repeated recordings
+        step = stamp_ns - self._latest.get(fluoroscope, stamp_ns)
+        self._latest[fluoroscope] = stamp_ns
+        if step > 0:
+            self._steps.append(step)
         if nearest is None:
-            self._last += 1
-            nearest = (stamp_ns, self._last, set())
+            nearest = (stamp_ns, self._new_number(stamp_ns), set())
             self._recent.append(nearest)
         nearest[2].add(fluoroscope)
         return nearest[1]
+
+    def _new_number(self, stamp_ns: int) -> int:
+        """Return the number of a new exposure, reserving those of the ones before that miss."""
+        interval = sorted(self._steps)[len(self._steps) // 2] if self._steps else NS_PER_S
+        for reserved in self._reserved:
+            if 2 * abs(reserved[0] - stamp_ns) < interval:
+                self._reserved.remove(reserved)
+                return reserved[1]
+        gap = stamp_ns - self._newest_ns
+        missing = round(gap / interval) - 1
+        if interval >= NS_PER_S or not 0 < missing <= MAX_MISSING:
+            missing = 0  # not a film, or its images paused
+        for k in range(1, missing + 1):
+            self._reserved.append((self._newest_ns + k * gap // (missing + 1), self._last + k))
+        self._last += missing + 1
+        self._newest_ns = stamp_ns
+        return self._last

@@ -36,6 +36,21 @@ def test_a_lost_image_shifts_no_numbers_if_the_tolerance_is_too_large():
     assert found == [[row + 1] * (1 if row == 50 else 2) for row in range(100)]
 
 
+def test_numbers_are_in_order_of_time_where_images_of_one_fluoroscope_arrive_first():
+    """The image of b at 300 ms is lost, and its next one arrives before that of a at 300 ms."""
+    numbers = ExposureNumbers('ab', 2 * MS)
+    came = [('b', ms) for ms in (0, 100, 200, 400)] + [('a', ms) for ms in range(0, 600, 100)]
+    found = {(name, ms): numbers.number(name, 10**18 + ms * MS) for name, ms in came}
+    assert found == {(name, ms): 1 + ms // 100 for name, ms in came}
+
+
+def test_stills_are_counted_without_gaps():
+    numbers = ExposureNumbers('ab', 2 * MS)
+    seconds = (1, 6, 11, 26, 31, 300)
+    found = [numbers.number(name, 10**18 + s * 1000 * MS) for s in seconds for name in 'ab']
+    assert found == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6]
+
+
 def test_a_repeated_recording_is_numbered_on():
     numbers = ExposureNumbers('ab', MS)
     found = [numbers.number(name, 5 * MS * i) for _ in range(2) for i in (1, 2) for name in 'ab']

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping
 from enum import Enum
+from itertools import chain
 from typing import Any, Protocol
 
 import numpy as np
@@ -168,6 +169,12 @@ class StampTolerance:
         half_ns = (self.interval_ns - 1) // 2
         return min(self.largest_ns, half_ns) if self.interval_ns else self.largest_ns
 
+    @property
+    def step_ns(self) -> int:
+        """Median of the last steps of all streams [ns], 0 before the first one."""
+        steps = sorted(chain.from_iterable(self._steps.values()))
+        return steps[len(steps) // 2] if steps else 0
+
     def add(self, fluoroscope: str, stamp_ns: int) -> None:
         """Add the stamp of a frame, 0 if unknown."""
         latest_ns = self._latest.get(fluoroscope, 0)
@@ -218,8 +225,6 @@ class ExposureNumbers:
         self._recent: deque[tuple[int, int, set[str]]] = deque(maxlen=RECENT_IMAGES)
         self._last = 0
         self._newest_ns = 0  # stamp of the exposure with the last number
-        self._latest: dict[str, int] = {}
-        self._steps: deque[int] = deque(maxlen=RECENT_STEPS)  # between images of a fluoroscope
         # Expected stamps and numbers of exposures without an image so far.
         self._reserved: deque[tuple[int, int]] = deque(maxlen=RECENT_IMAGES)
         self._without_stamp = dict.fromkeys(fluoroscopes, 0)
@@ -238,10 +243,6 @@ class ExposureNumbers:
                 continue
             if nearest is None or offset <= abs(nearest[0] - stamp_ns):
                 nearest = exposure  # the newest of equally near ones, for repeated recordings
-        step = stamp_ns - self._latest.get(fluoroscope, stamp_ns)
-        self._latest[fluoroscope] = stamp_ns
-        if step > 0:
-            self._steps.append(step)
         if nearest is None:
             nearest = (stamp_ns, self._new_number(stamp_ns), set())
             self._recent.append(nearest)
@@ -250,7 +251,7 @@ class ExposureNumbers:
 
     def _new_number(self, stamp_ns: int) -> int:
         """Return the number of a new exposure, reserving those of the ones before that miss."""
-        interval = sorted(self._steps)[len(self._steps) // 2] if self._steps else NS_PER_S
+        interval = self._tolerance.step_ns or NS_PER_S
         for reserved in self._reserved:
             if 2 * abs(reserved[0] - stamp_ns) < interval:
                 self._reserved.remove(reserved)

@@ -68,6 +68,7 @@ class Kind(str, Enum):
     # Input that cannot be right.
     DUPLICATE_NAME = 'duplicate_name'
     FRAMES_SHIFTED = 'frames_shifted'
+    FRAMES_DELAYED = 'frames_delayed'
     IDS_REVERSED = 'ids_reversed'
     IDS_SHIFTED = 'ids_shifted'
     IMAGE_MIRRORED = 'image_mirrored'

@@ -69,6 +69,7 @@ from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 from fluoro_calib_ros.reconstruction import epipolar, lost_targets, observed_noise
+from fluoro_calib_ros.reconstruction.delay import Delay, delay_finding
 
 PHANTOM = rig().phantom
 CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
@@ -430,6 +431,7 @@ MAKERS = {
     Kind.WEAK_INTERSECTION: weak_intersection,
     Kind.DUPLICATE_NAME: lambda: raised(inputs.validate_names, ('a', 'A')),
     Kind.FRAMES_SHIFTED: lambda: trial(Kind.FRAMES_SHIFTED),
+    Kind.FRAMES_DELAYED: lambda: delay_finding(('a', 'b'), Delay(-0.25, 0.01, 1.0), 0.01),
     Kind.IDS_REVERSED: lambda: inputs.CONFUSIONS[2][0],
     Kind.IDS_SHIFTED: lambda: inputs.CONFUSIONS[0][0],
     Kind.IMAGE_MIRRORED: lambda: inputs._MIRRORED,
@@ -668,6 +670,10 @@ SENTENCES = {
     ),
     Kind.FRAMES_SHIFTED: (
         '# % of the rays miss each other: the frame numbers of fluoroscope b are too small by #'
+    ),
+    Kind.FRAMES_DELAYED: (
+        'fluoroscope b takes its images # frame intervals (# ms) before fluoroscope a: points '
+        'that move are wrong; trigger the fluoroscopes at the same time'
     ),
     Kind.TARGETS_EXCHANGED: (
         'targets # and # are exchanged in fluoroscope a or b: most of their rays miss each other, '

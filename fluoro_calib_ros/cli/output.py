@@ -113,13 +113,19 @@ def print_rig_evidence(source: Path, evidence: RigEvidence, reject: float) -> No
         print_note(f'{source}: {evidence.drift.widening.sentence}')
     if evidence.noise is not None:
         print_note(f'{source}: {evidence.noise.sentence}')
+    if evidence.delay is not None:
+        print_note(f'{source}: {evidence.delay.sentence}')
     if evidence.widening > 1:
+        advice = (
+            '; check the sigma of the image points, whether they count from 1, how many are '
+            'outside the calibrated area, and whether a fluoroscope has moved since its '
+            'calibration'
+        )
         print_note(
             f'{source}: the rays miss each other by more than their standard deviations allow; '
             f'the limit of false matches was widened {evidence.widening:.1f} times, to '
-            f'{reject * evidence.widening:.1f} standard deviations; check the sigma of the image '
-            'points, whether they count from 1, how many are outside the calibrated area, and '
-            'whether a fluoroscope has moved since its calibration'
+            f'{reject * evidence.widening:.1f} standard deviations'
+            f'{advice if evidence.delay is None else ""}'
         )
 
 

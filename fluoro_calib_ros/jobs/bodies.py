@@ -43,6 +43,7 @@ from ..options import option
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.delay import delay_of
 from ..reconstruction.epipolar import why_rays_miss
 from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
@@ -434,6 +435,7 @@ def intersected(
         disagreement=disagreement,
         widening=scatter.factor,
         noise=noise,
+        delay=delay_of(frames, calibrations, orientation, options),
     )
 
 

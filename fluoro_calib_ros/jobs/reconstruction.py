@@ -24,6 +24,7 @@ from ..io.bodies import point_table
 from ..options import option
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.delay import delay_of
 from ..reconstruction.epipolar import why_rays_miss
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.lost_targets import lost_targets
@@ -177,6 +178,7 @@ def reconstruct(
         widening=scatter.factor,
         lost_targets=tuple(lost),
         noise=noise,
+        delay=delay_of(frames, calibrations, orientation, options),
     )
 
 

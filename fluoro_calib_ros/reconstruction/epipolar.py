@@ -134,8 +134,8 @@ class EpipolarGeometry:
             factor_b=length_b / norm,
         )
 
-    def by_orientation(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
-        """Return derivatives (n, 18) of the residuals by T, w, xp, yp, c of a and of b."""
+    def by_essential(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
+        """Return derivatives (n, 9) of the residuals by the elements of E, by rows."""
         x_a = _directions(uv_a, self._interior[0])
         x_b = _directions(uv_b, self._interior[1])
         c_a, c_b = self._interior[:, 2]
@@ -143,7 +143,11 @@ class EpipolarGeometry:
         slope_b = (x_a @ self.essential.T)[:, :2] / c_b
         norm = np.sqrt(np.sum(slope_a * slope_a + slope_b * slope_b, axis=1))
         terms = (x_b[:, :, None] * x_a[:, None, :]).reshape(-1, 9)
-        return np.asarray(terms @ self._derivative / norm[:, None])
+        return np.asarray(terms / norm[:, None])
+
+    def by_orientation(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
+        """Return derivatives (n, 18) of the residuals by T, w, xp, yp, c of a and of b."""
+        return np.asarray(self.by_essential(uv_a, uv_b) @ self._derivative)
 
 
 def _directions(uv: ArrayLike, interior: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -319,6 +319,24 @@ def test_doubt_about_a_body_makes_a_trial_doubtful():
     assert row['verdict'] == 'fail' and row['cause'] == 'marker 3 has moved; it is mirrored'
 
 
+def test_a_trial_with_a_delayed_fluoroscope_fails_with_that_cause():
+    document = {
+        'frames': 9,
+        'points': 90,
+        'status': {'OK': 90},
+        'lost_targets': [],
+        'widening': 1.5,
+        'drift': None,
+        'delay': {'sentence': 'b is late', 'severity': 'warning'},
+    }
+    step = SimpleNamespace(command='reconstruct')
+    row = trial_row('walk', 'pass', [(step, Done(0, document))])
+    assert row['verdict'] == 'fail' and row['cause'] == 'b is late'
+    document['widening'] = 1.0
+    row = trial_row('walk', 'pass', [(step, Done(0, document))])
+    assert row['verdict'] == 'fail' and row['cause'] == 'b is late'
+
+
 def test_step_is_kept_only_with_its_digest_and_all_that_it_wrote(tmp_path):
     step = SimpleNamespace(key='k', out=tmp_path / 'out', document=tmp_path / 'document.json')
     work = SimpleNamespace(_state={'k': {'digest': 'd', 'status': 3}, 'other': 5})

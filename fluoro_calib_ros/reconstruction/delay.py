@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Delay between the fluoroscopes of a recording, estimated from rays that miss each other.
+
+If fluoroscope b takes its images d frame intervals after a, the epipolar residual of a moving
+point is d times its change from one frame of b to the next. Residuals due to any change of the
+rig are linear in that of the essential matrix, and are eliminated (Frisch and Waugh, Econometrica
+1, 1933), so that only a motion that no rig explains counts as a delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.fluoroscope_calibration import Calibrations
+from ..exposures.frame import Frame, Frames
+from ..exposures.pairing import RecordedPairing
+from ..exposures.stamps import NS_PER_S
+from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..rows import chosen_rows, joined_rows
+from .epipolar import EpipolarGeometry
+from .reconstruct import corrected_view, match_views, pair_recording
+
+MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
+MIN_SIGMAS = 5.0  # minimum delay over its standard deviation: one in a million by chance
+MAX_FRAMES = 1.0  # maximum delay: neighbouring frames do not show the motion beyond them
+MIN_EXPLAINED = 0.5  # minimum share of the squared misses beyond their noise: the main cause
+STEPS = 10  # reweighted Gauss-Newton steps
+ROBUST = 2.4  # residual with half the weight, in standard deviations
+
+
+def delay_of(
+    frames: Frames,
+    calibrations: Calibrations,
+    orientation: RigOrientation,
+    pairing: RecordedPairing,
+) -> Finding | None:
+    """Return a warning if rays miss each other because a fluoroscope is delayed, or None.
+
+    frames: those of all fluoroscopes of the orientation. The warning is on the one whose delay
+    relative to the first is most significant.
+    """
+    first, *others = orientation.fluoroscopes
+    exposures, _ = pair_recording(frames, orientation.fluoroscopes, pairing)
+    delays: dict[str, Delay] = {}
+    for name in others:
+        geometry = EpipolarGeometry(orientation, first, name)
+        delay = fitted_delay(_motion(exposures, calibrations, geometry))
+        if delay is not None and delay.is_cause:
+            delays[name] = delay
+    if not delays:
+        return None
+    name = max(delays, key=lambda n: abs(delays[n].frames) / delays[n].sd)
+    return delay_finding((first, name), delays[name], _interval_s(exposures, first))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Epipolar residuals of n points in motion, in fluoroscopes a and b."""
+
+    target_id: NDArray[np.int64]  #: (n,)
+    #: (n, 3), residuals of a's points with b's points in its previous, the same, and its next
+    #: frame [px]
+    residual: NDArray[np.float64]
+    variance: NDArray[np.float64]  #: (n,), expected variance of the residuals [px^2]
+    #: (n,), the part of it due to noise of b, which is independent in every frame [px^2]
+    noise: NDArray[np.float64]
+    #: (n, 9), derivatives by the elements of the essential matrix, apart from its scale, which
+    #: changes no epipolar line
+    by_rig: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Delay of fluoroscope b behind a."""
+
+    frames: float  #: delay in frame intervals
+    sd: float  #: its standard deviation, for errors that are constant for each target
+    explained: float  #: share of the squared residuals beyond their noise that it explains
+
+    @property
+    def is_cause(self) -> bool:
+        """Whether it is significant, and the main cause of the residuals."""
+        is_significant = MIN_SIGMAS * self.sd < abs(self.frames) < MAX_FRAMES
+        return is_significant and self.explained > MIN_EXPLAINED
+
+
+def fitted_delay(motion: Motion) -> Delay | None:
+    """Estimate the delay by reweighted least squares; return None if nothing moves.
+
+    Images that b takes late by the delay show the points after the time of a. The second
+    differences of the residuals contribute half of the squared delay.
+    """
+    if len(motion.target_id) <= 2 * motion.by_rig.shape[1]:
+        return None
+    previous, present, following = motion.residual.T
+    change = 0.5 * (following - previous)
+    bend = 0.5 * (following - 2 * present + previous)
+    delay = 0.0
+    rest = present - np.median(present)
+    for _ in range(STEPS):
+        size = max(1.4826 * float(np.median(np.abs(rest))), 1e-9)
+        weight = 1 / (1 + (rest / (ROBUST * size)) ** 2)
+        root = np.sqrt(weight)[:, None]
+        moving = root * np.column_stack([change, present + delay**2 * bend])
+        by_rig = root * motion.by_rig
+        moving -= by_rig @ np.linalg.lstsq(by_rig, moving, rcond=1e-10)[0]
+        changes, targets = moving.T
+        # The noise of both neighbouring frames adds half its variance to the squared changes.
+        of_noise = 0.5 * weight * motion.noise
+        information = float(changes @ changes - of_noise.sum())
+        if information <= 0:
+            return None
+        delay = float(np.clip(changes @ targets / information, -2 * MAX_FRAMES, 2 * MAX_FRAMES))
+        rest = (targets - delay * changes) / root[:, 0]
+    # Errors of survey and correction stay the same for a target: sums over each are independent.
+    _, target = np.unique(motion.target_id, return_inverse=True)
+    scores = changes * rest * root[:, 0] + delay * of_noise
+    sums = np.bincount(target, weights=scores)
+    squares = [weight @ (r * r) for r in (present, present + delay**2 * bend - delay * change)]
+    beyond = squares[0] - weight @ motion.variance
+    explained = (squares[0] - squares[1]) / beyond if beyond > 0 else 0.0
+    return Delay(delay, float(np.sqrt(sums @ sums) / information), float(explained))
+
+
+def delay_finding(names: tuple[str, str], delay: Delay, interval_s: float) -> Finding:
+    """Return the warning that the second of two fluoroscopes is delayed.
+
+    interval_s: frame interval [s], 0 if unknown.
+    """
+    first, name = names
+    size = abs(delay.frames)
+    time = f' ({1e3 * interval_s * size:.1f} ms)' if interval_s else ''
+    return Finding(
+        Kind.FRAMES_DELAYED,
+        f'fluoroscope {name} takes its images {size:.2f} frame intervals{time} '
+        f'{"after" if delay.frames > 0 else "before"} fluoroscope {first}',
+        Place((first, name), name=''),
+        'points that move are wrong; trigger the fluoroscopes at the same time',
+        Severity.WARNING,
+        numbers={'frames': delay.frames, 'sd': delay.sd, 'interval_s': interval_s},
+    )
+
+
+def _interval_s(exposures: Sequence[Mapping[str, Frame]], name: str) -> float:
+    """Return the median interval of the frames of a fluoroscope [s], 0 without stamps."""
+    stamps = [exposure[name].stamp_ns for exposure in exposures if name in exposure]
+    return float(np.median(np.diff(stamps))) / NS_PER_S if len(stamps) > 1 else 0.0
+
+
+def _motion(
+    exposures: Sequence[Mapping[str, Frame]],
+    calibrations: Calibrations,
+    geometry: EpipolarGeometry,
+) -> Motion:
+    """Return the residuals of exposures, evenly spaced, whose neighbours have frames of b."""
+    a, b = geometry.fluoroscopes
+    both = [exposure for exposure in exposures if a in exposure and b in exposure]
+    successive = list(_successive(both, b))
+    scale = geometry.essential.ravel() / np.linalg.norm(geometry.essential)
+    parts = [
+        Motion(np.zeros(0, int), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 9)))
+    ]
+    steps = np.linspace(0, len(successive) - 1, min(MAX_EXPOSURES, len(successive)))
+    for row in steps.astype(int):
+        before, exposure, after = successive[row]
+        views = [corrected_view(exposure[a], calibrations[a])]
+        views += [corrected_view(one[b], calibrations[b]) for one in (before, exposure, after)]
+        matched = match_views(views)
+        in_a, *in_b = matched.uv
+        sigma_a, _, sigma_b, _ = matched.sigma
+        found = [geometry.residuals(in_a, uv, sigma_a, sigma_b) for uv in in_b]
+        by_rig = geometry.by_essential(in_a, in_b[1])
+        # An error of the correction is the same in neighbouring frames.
+        noise = sigma_b**2 - matched.correction_sd[2] ** 2
+        part = Motion(
+            np.asarray(matched.target_id),
+            np.column_stack([one.residual for one in found]),
+            found[1].sd_total ** 2,
+            found[1].factor_b ** 2 * noise,
+            by_rig - np.outer(by_rig @ scale, scale),
+        )
+        parts.append(chosen_rows(part, np.all(np.isfinite(part.residual), axis=1)))
+    return joined_rows(parts)
+
+
+def _successive(
+    exposures: Sequence[Mapping[str, Frame]], name: str
+) -> Iterator[Sequence[Mapping[str, Frame]]]:
+    """Yield three exposures at a time whose frames of a fluoroscope follow each other."""
+    follows = [two[name].number == one[name].number + 1 for one, two in pairwise(exposures)]
+    for row, both in enumerate(pairwise(follows)):
+        if all(both):
+            yield exposures[row : row + 3]

@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Delay between the fluoroscopes of a recording."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rigs import true_calibrations, true_orientation
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros.exposures.pairing import RecordedPairing
+from fluoro_calib_ros.findings import Kind, Severity
+from fluoro_calib_ros.jobs.reconstruction import reconstruct
+from fluoro_calib_ros.reconstruction.delay import delay_of
+from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
+
+NOISE_PX = 0.25
+RATE_HZ = 60.0
+
+
+@functools.cache
+def rig():
+    """A rig of three fluoroscopes without distortion."""
+    return virtual_rig(2, strength=0.0, names=('a', 'b', 'c'), between_deg=60.0)
+
+
+@functools.cache
+def known(names='ab'):
+    """True calibrations and orientation of some fluoroscopes of the rig."""
+    calibrations = true_calibrations(rig().fluoroscopes, NOISE_PX)
+    orientation = true_orientation(rig().fluoroscopes, calibrations).subset(list(names))
+    return {name: calibrations[name] for name in names}, orientation
+
+
+@functools.cache
+def recorded(steps, names='ab', seed=4, seconds=2.0):
+    """Frames of which those of the last fluoroscope are late by quarters of a frame interval."""
+    tracking = simulate_tracking(rig(), seconds, 4 * RATE_HZ, seed=seed, noise_px=NOISE_PX)
+    late = {name: steps if name == names[-1] else 0 for name in names}
+    return {
+        name: [
+            replace(frame, number=(frame.number - late[name]) // 4)
+            for frame in tracking.frames[name][4 + late[name] :: 4]
+        ]
+        for name in names
+    }
+
+
+def found(frames, names='ab', orientation=None):
+    calibrations, known_orientation = known(names)
+    return delay_of(frames, calibrations, orientation or known_orientation, RecordedPairing())
+
+
+@pytest.mark.parametrize('names', ['ab', 'abc'])
+@pytest.mark.parametrize('steps', [-1, 1, 2, 3])
+def test_a_fluoroscope_that_is_late_or_early_is_named(steps, names):
+    finding = found(recorded(steps, names), names)
+    assert (finding.kind, finding.severity) == (Kind.FRAMES_DELAYED, Severity.WARNING)
+    assert finding.place.fluoroscopes == ('a', names[-1])
+    assert abs(finding.numbers['frames'] - steps / 4) < 4 * finding.numbers['sd'] < 0.1
+    assert finding.numbers['interval_s'] == pytest.approx(1 / RATE_HZ, rel=1e-6)
+
+
+def test_the_standard_deviation_is_that_of_repetitions():
+    found_numbers = [found(recorded(2, seed=seed, seconds=1.0)).numbers for seed in range(20)]
+    errors = np.array([numbers['frames'] for numbers in found_numbers]) - 0.5
+    stated = np.sqrt(np.mean([numbers['sd'] ** 2 for numbers in found_numbers]))
+    # The standard deviation of 20 values is known to 16 %.
+    assert 0.6 < np.std(errors) / stated < 1.4 and abs(errors.mean()) < stated
+
+
+def dented(frames):
+    """Frames of which those of b have a local distortion of 1 px."""
+
+    def change(frame):
+        shift = np.exp(-np.sum((frame.uv - [500, 600]) ** 2, axis=1) / (2 * 150**2))
+        return replace(frame, uv=frame.uv + shift[:, None] * [0.6, 0.8])
+
+    return {**frames, 'b': [change(frame) for frame in frames['b']]}
+
+
+def renamed(frames):
+    """Frames of which every fifth of b has wrong ids."""
+    b = [
+        replace(frame, target_id=np.roll(frame.target_id, 1)) if frame.number % 5 == 0 else frame
+        for frame in frames['b']
+    ]
+    return {**frames, 'b': b}
+
+
+@pytest.mark.parametrize('change', [dict, dented, renamed])
+def test_other_faults_are_no_delay(change):
+    assert found(change(recorded(0))) is None
+
+
+def test_a_moved_fluoroscope_is_no_delay():
+    _, orientation = known()
+    rotation = orientation.rotation.copy()
+    rotation[1] = Rotation.from_rotvec([0.004, -0.003, 0.002]).as_matrix() @ rotation[1]
+    moved = replace(orientation, rotation=rotation)
+    assert found(recorded(0), orientation=moved) is None
+
+
+def test_points_at_rest_and_short_recordings_tell_nothing():
+    frames = recorded(2)
+    still = {name: [replace(f, uv=fs[0].uv) for f in fs] for name, fs in frames.items()}
+    assert found(still) is None
+    assert found({name: fs[:2] for name, fs in frames.items()}) is None
+
+
+def test_reconstruction_of_a_recording_tells_the_delay():
+    calibrations, orientation = known()
+    outcome = reconstruct(recorded(1), calibrations, orientation)
+    assert outcome.delay.kind is Kind.FRAMES_DELAYED
+    assert reconstruct(recorded(0), calibrations, orientation).delay is None

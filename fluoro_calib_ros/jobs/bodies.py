@@ -435,7 +435,7 @@ def intersected(
         disagreement=disagreement,
         widening=scatter.factor,
         noise=noise,
-        delay=delay_of(frames, calibrations, orientation, options),
+        delay=delay_of(paired, calibrations, orientation),
     )
 
 

@@ -51,6 +51,7 @@ from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
 from ..io.versions import HEALING, LEARNED_SHAPES, write_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.delay import delay_of
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
@@ -156,8 +157,8 @@ def heal_rig(
     Raises
     ------
     DataError
-        For frames that cannot be paired or corrected, bodies without learned shapes, and too few
-        exposures that show bodies.
+        For frames that cannot be paired or corrected, fluoroscopes that take their images at
+        different times, bodies without learned shapes, and too few exposures that show bodies.
     """
     options = options or HealingOptions()
     step = progress or (lambda done, total: None)
@@ -220,6 +221,9 @@ def _exposures_of(
         marker_frames, calibrations, orientation, options, must_explain=False
     )
     paired, _ = pair_recording(frames_with_noise, orientation.fluoroscopes, options)
+    delay = delay_of(paired, calibrations, orientation)
+    if delay is not None:  # it would look like a change of the rig
+        raise DataError(delay)
     return paired, noise
 
 

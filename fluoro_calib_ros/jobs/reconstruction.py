@@ -32,6 +32,7 @@ from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import (
     ReconstructedFrame,
     orientation_of_recorded,
+    pair_recording,
     reconstruct_recording,
 )
 
@@ -178,7 +179,7 @@ def reconstruct(
         widening=scatter.factor,
         lost_targets=tuple(lost),
         noise=noise,
-        delay=delay_of(frames, calibrations, orientation, options),
+        delay=delay_of(pair_recording(frames, names, options)[0], calibrations, orientation),
     )
 
 

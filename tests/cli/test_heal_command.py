@@ -52,6 +52,9 @@ def rig(tmp_path_factory):
         name: [*frames[:30], *bumped.frames[name][30:]] for name, frames in healthy.frames.items()
     }
     write_knee_recording(folder, 'halfway', replace(healthy, frames=halfway))
+    later = simulate_knee(virtual, knee, walking(knee, (np.arange(60) + 0.5) / 60))
+    late = {'a': healthy.frames['a'], 'b': later.frames['b']}
+    write_knee_recording(folder, 'late', replace(healthy, frames=late))
     return folder
 
 
@@ -155,3 +158,10 @@ def test_what_cannot_be_healed_is_refused(rig, tmp_path, capsys):
     assert run(*inside, '--out', rig / 'result') == 1
     assert 'would be overwritten' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
+
+
+def test_fluoroscopes_that_are_not_synchronous_are_not_healed(rig, tmp_path, capsys):
+    assert heal(rig, 'late', tmp_path / 'healed') == 1
+    err = capsys.readouterr().err
+    assert 'fluoroscope b takes its images 0.5' in err and 'after fluoroscope a' in err
+    assert not (tmp_path / 'healed').exists()

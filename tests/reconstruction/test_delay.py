@@ -15,6 +15,7 @@ from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.jobs.reconstruction import reconstruct
 from fluoro_calib_ros.reconstruction.delay import delay_of
+from fluoro_calib_ros.reconstruction.reconstruct import pair_recording
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
@@ -51,7 +52,8 @@ def recorded(steps, names='ab', seed=4, seconds=2.0):
 
 def found(frames, names='ab', orientation=None):
     calibrations, known_orientation = known(names)
-    return delay_of(frames, calibrations, orientation or known_orientation, RecordedPairing())
+    exposures, _ = pair_recording(frames, list(names), RecordedPairing())
+    return delay_of(exposures, calibrations, orientation or known_orientation)
 
 
 @pytest.mark.parametrize('names', ['ab', 'abc'])

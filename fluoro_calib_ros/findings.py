@@ -69,6 +69,7 @@ class Kind(str, Enum):
     DUPLICATE_NAME = 'duplicate_name'
     FRAMES_SHIFTED = 'frames_shifted'
     FRAMES_DELAYED = 'frames_delayed'
+    FRAME_LOST = 'frame_lost'
     IDS_REVERSED = 'ids_reversed'
     IDS_SHIFTED = 'ids_shifted'
     IMAGE_MIRRORED = 'image_mirrored'

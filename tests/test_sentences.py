@@ -69,7 +69,12 @@ from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 from fluoro_calib_ros.reconstruction import epipolar, lost_targets, observed_noise
-from fluoro_calib_ros.reconstruction.delay import Delay, delay_finding
+from fluoro_calib_ros.reconstruction.timing import (
+    Delay,
+    Motion,
+    delay_finding,
+    find_lost_frame,
+)
 
 PHANTOM = rig().phantom
 CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
@@ -209,6 +214,16 @@ def moved_rig():
     present = orientation()
     shifted = present.position_mm + np.array([[0.0, 0, 0], [20.0, 0, 0]])
     return orienting._change(present, replace(present, position_mm=shifted))
+
+
+def lost_frame():
+    """Of 20 exposures, those after the tenth fit the previous frames of b."""
+    exposure = np.arange(20)
+    residual = np.full((20, 3), 9.0)
+    residual[:10, 1] = residual[10:, 0] = 0.1
+    one = np.ones(20)
+    motion = Motion(exposure, exposure, residual, one, one, by_rig=np.ones((20, 9)))
+    return find_lost_frame(('a', 'b'), motion)
 
 
 def trial(kind):
@@ -431,6 +446,7 @@ MAKERS = {
     Kind.WEAK_INTERSECTION: weak_intersection,
     Kind.DUPLICATE_NAME: lambda: raised(inputs.validate_names, ('a', 'A')),
     Kind.FRAMES_SHIFTED: lambda: trial(Kind.FRAMES_SHIFTED),
+    Kind.FRAME_LOST: lost_frame,
     Kind.FRAMES_DELAYED: lambda: delay_finding(('a', 'b'), Delay(-0.25, 0.01, 1.0), 0.01),
     Kind.IDS_REVERSED: lambda: inputs.CONFUSIONS[2][0],
     Kind.IDS_SHIFTED: lambda: inputs.CONFUSIONS[0][0],
@@ -670,6 +686,10 @@ SENTENCES = {
     ),
     Kind.FRAMES_SHIFTED: (
         '# % of the rays miss each other: the frame numbers of fluoroscope b are too small by #'
+    ),
+    Kind.FRAME_LOST: (
+        'fluoroscope b has lost a frame before exposure #: add # to the numbers of its frames '
+        'from # on'
     ),
     Kind.FRAMES_DELAYED: (
         'fluoroscope b takes its images # frame intervals (# ms) before fluoroscope a: points '

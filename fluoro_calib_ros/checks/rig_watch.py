@@ -281,15 +281,15 @@ class RigEvidence:
         more than their standard deviations allow.
     noise : Finding or None
         Set if image points have no sigma and their rays show more noise than the calibration.
-    delay : Finding or None
-        Set if rays miss each other because a fluoroscope takes its images at another time.
+    timing : Finding or None
+        Set if rays miss each other because a fluoroscope is delayed or has lost a frame.
     """
 
     drift: DriftVerdict | None = None
     disagreement: str = ''
     widening: float = 1.0
     noise: Finding | None = None
-    delay: Finding | None = None
+    timing: Finding | None = None
 
 
 class RecordingDriftWatch(RigDriftWatch):

@@ -113,8 +113,8 @@ def print_rig_evidence(source: Path, evidence: RigEvidence, reject: float) -> No
         print_note(f'{source}: {evidence.drift.widening.sentence}')
     if evidence.noise is not None:
         print_note(f'{source}: {evidence.noise.sentence}')
-    if evidence.delay is not None:
-        print_note(f'{source}: {evidence.delay.sentence}')
+    if evidence.timing is not None:
+        print_note(f'{source}: {evidence.timing.sentence}')
     if evidence.widening > 1:
         advice = (
             '; check the sigma of the image points, whether they count from 1, how many are '
@@ -125,7 +125,7 @@ def print_rig_evidence(source: Path, evidence: RigEvidence, reject: float) -> No
             f'{source}: the rays miss each other by more than their standard deviations allow; '
             f'the limit of false matches was widened {evidence.widening:.1f} times, to '
             f'{reject * evidence.widening:.1f} standard deviations'
-            f'{advice if evidence.delay is None else ""}'
+            f'{advice if evidence.timing is None else ""}'
         )
 
 

@@ -441,10 +441,10 @@ def _rig_cells(document: Mapping[str, Any]) -> dict[str, Any]:
     cells = {'widening': widening, 'drift': drift.get('kind', '')}
     if drift.get('level') in WRONG_DRIFT:
         return cells | {'verdict': 'fail', 'cause': drift['message']}
-    delay = document.get('delay')
-    if delay is not None or widening > 1:
+    timing = document.get('timing')
+    if timing is not None or widening > 1:
         cause = 'the rays miss each other by more than their standard deviations allow'
-        return cells | {'verdict': 'fail', 'cause': delay['sentence'] if delay else cause}
+        return cells | {'verdict': 'fail', 'cause': timing['sentence'] if timing else cause}
     return cells
 
 

@@ -229,7 +229,7 @@ def rig_document(evidence: RigEvidence, begin_ns: int) -> dict[str, Any]:
     return {
         'noise': None if evidence.noise is None else finding_document(evidence.noise),
         'widening': evidence.widening,
-        'delay': None if evidence.delay is None else finding_document(evidence.delay),
+        'timing': None if evidence.timing is None else finding_document(evidence.timing),
         'drift': drift_document(evidence.drift, begin_ns),
     }
 

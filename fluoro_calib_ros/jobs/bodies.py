@@ -43,7 +43,6 @@ from ..options import option
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.delay import delay_of
 from ..reconstruction.epipolar import why_rays_miss
 from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
@@ -53,6 +52,7 @@ from ..reconstruction.reconstruct import (
     orientation_of_recorded,
     pair_recording,
 )
+from ..reconstruction.timing import timing_fault
 from .image_sources import fluoroscope_folders, is_image_bag, open_sources
 from .reconstruction import check_orientation
 
@@ -435,7 +435,7 @@ def intersected(
         disagreement=disagreement,
         widening=scatter.factor,
         noise=noise,
-        delay=delay_of(paired, calibrations, orientation),
+        timing=timing_fault(paired, calibrations, orientation),
     )
 
 

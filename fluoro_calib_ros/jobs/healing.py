@@ -51,10 +51,10 @@ from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
 from ..io.versions import HEALING, LEARNED_SHAPES, write_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.delay import delay_of
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
+from ..reconstruction.timing import timing_fault
 
 BLOCKS = 10  # blocks of a recording, alternately used for the diagnosis and for its verdict
 MAX_EXPOSURES = 100  # maximum number used for each of these, evenly spread
@@ -221,9 +221,9 @@ def _exposures_of(
         marker_frames, calibrations, orientation, options, must_explain=False
     )
     paired, _ = pair_recording(frames_with_noise, orientation.fluoroscopes, options)
-    delay = delay_of(paired, calibrations, orientation)
-    if delay is not None:  # it would look like a change of the rig
-        raise DataError(delay)
+    fault = timing_fault(paired, calibrations, orientation)
+    if fault is not None:  # it would look like a change of the rig
+        raise DataError(fault)
     return paired, noise
 
 

@@ -24,7 +24,6 @@ from ..io.bodies import point_table
 from ..options import option
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.delay import delay_of
 from ..reconstruction.epipolar import why_rays_miss
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.lost_targets import lost_targets
@@ -35,6 +34,7 @@ from ..reconstruction.reconstruct import (
     pair_recording,
     reconstruct_recording,
 )
+from ..reconstruction.timing import timing_fault
 
 if TYPE_CHECKING:
     import pandas
@@ -179,7 +179,7 @@ def reconstruct(
         widening=scatter.factor,
         lost_targets=tuple(lost),
         noise=noise,
-        delay=delay_of(pair_recording(frames, names, options)[0], calibrations, orientation),
+        timing=timing_fault(pair_recording(frames, names, options)[0], calibrations, orientation),
     )
 
 

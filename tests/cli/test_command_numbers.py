@@ -427,7 +427,7 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         drift=Fake(widening=None),
         lost_targets=[],
         noise=None,
-        delay=None,
+        timing=None,
         plot=None,
     )
     monkeypatch.setattr('fluoro_calib_ros.jobs.reconstruction.reconstruct', lambda *_: made)

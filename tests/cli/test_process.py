@@ -327,7 +327,7 @@ def test_a_trial_with_a_delayed_fluoroscope_fails_with_that_cause():
         'lost_targets': [],
         'widening': 1.5,
         'drift': None,
-        'delay': {'sentence': 'b is late', 'severity': 'warning'},
+        'timing': {'sentence': 'b is late', 'severity': 'warning'},
     }
     step = SimpleNamespace(command='reconstruct')
     row = trial_row('walk', 'pass', [(step, Done(0, document))])

@@ -1,19 +1,20 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Delay between the fluoroscopes of a recording, estimated from rays that miss each other.
+"""Delays between the fluoroscopes of a recording, estimated from rays that miss each other.
 
 If fluoroscope b takes its images d frame intervals after a, the epipolar residual of a moving
 point is d times its change from one frame of b to the next. Residuals due to any change of the
 rig are linear in that of the essential matrix, and are eliminated (Frisch and Waugh, Econometrica
-1, 1933), so that only a motion that no rig explains counts as a delay.
+1, 1933), so that only a motion that no rig explains counts as a delay. If a frame is lost, later
+ones are paired with those of the neighbouring exposure: the delay changes by one interval.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,30 +37,39 @@ MAX_FRAMES = 1.0  # maximum delay: neighbouring frames do not show the motion be
 MIN_EXPLAINED = 0.5
 STEPS = 10  # reweighted Gauss-Newton steps
 ROBUST = 2.4  # residual with half the weight, in standard deviations
+LOSS = 0.143  # mean log-likelihood lost by normal residuals under Cauchy noise of that scale
+# Minimum log-likelihood gained by a lost frame: five standard deviations, and 1200 tries.
+MIN_GAIN = 20.0
+# Maximum share by which the loss that remains exceeds that of the noise. It is 0.12 if a frame is
+# lost, and at least 0.14 if something else is wrong and a lost frame seems to explain it.
+MAX_EXCESS = 0.25
 KEPT = 0.796  # weighted variance of normal residuals over their variance, by these weights
 
 
-def delay_of(
+def timing_fault(
     exposures: Sequence[Mapping[str, Frame]],
     calibrations: Calibrations,
     orientation: RigOrientation,
 ) -> Finding | None:
-    """Return a warning if a fluoroscope takes its images at other times than the first, or None.
+    """Return a warning if the frames of exposures were not taken at the same time, or None.
 
-    exposures: frames of a recording by fluoroscope, in temporal order. The warning is on the
-    fluoroscope with the most significant delay.
+    A fluoroscope is delayed relative to the first, or has lost a frame. exposures: frames of a
+    recording by fluoroscope, in temporal order. The warning is on the most significant delay.
     """
     first, *others = orientation.fluoroscopes
+    motions = {}
     delays: dict[str, Delay] = {}
     for name in others:
         geometry = EpipolarGeometry(orientation, first, name)
-        delay = fitted_delay(_motion(exposures, calibrations, geometry))
+        motions[name] = _motion(exposures, calibrations, geometry)
+        delay = fitted_delay(motions[name])
         if delay is not None and delay.is_cause:
             delays[name] = delay
-    if not delays:
-        return None
-    name = max(delays, key=lambda n: abs(delays[n].frames) / delays[n].sd)
-    return delay_finding((first, name), delays[name], _interval_s(exposures, first))
+    if delays:
+        name = max(delays, key=lambda n: abs(delays[n].frames) / delays[n].sd)
+        return delay_finding((first, name), delays[name], _interval_s(exposures, first))
+    lost = (find_lost_frame((first, name), motion) for name, motion in motions.items())
+    return next((finding for finding in lost if finding is not None), None)
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,7 @@ class Motion:
     """Epipolar residuals of n points in motion, in fluoroscopes a and b."""
 
     target_id: NDArray[np.int64]  #: (n,)
+    exposure: NDArray[np.int64]  #: (n,), numbers of the exposures, ascending
     #: (n, 3), residuals of a's points with b's points in its previous, the same, and its next
     #: frame [px]
     residual: NDArray[np.float64]
@@ -133,6 +144,42 @@ def fitted_delay(motion: Motion) -> Delay | None:
     return Delay(delay, float(np.sqrt(sums @ sums) / information), share)
 
 
+def find_lost_frame(names: tuple[str, str], motion: Motion) -> Finding | None:
+    """Return a warning if the delay of b changes by a frame interval, or None.
+
+    The exposure at which it changes is the most likely one under Cauchy noise. Unlike that of a
+    constant delay, this search cannot eliminate changes of the rig: nothing else may be wrong.
+    """
+    count = len(motion.exposure)
+    begins = np.flatnonzero(np.diff(motion.exposure)) + 1  # first rows of the exposures
+    if not len(begins):
+        return None
+    scale = ROBUST**2 * motion.variance[:, None]
+    loss = np.cumsum(np.log1p(motion.residual**2 / scale), axis=0)
+    # A point of a is that of the previous, the same or the next frame of b.
+    sides = list(permutations(range(3), 2))
+    totals = [loss[begins - 1, i] + loss[-1, j] - loss[begins - 1, j] for i, j in sides]
+    side, row = np.unravel_index(np.argmin(totals), (len(sides), len(begins)))
+    remaining = float(totals[side][row])
+    gain = float(loss[-1].min()) - remaining
+    excess = remaining - LOSS * count
+    if gain < MIN_GAIN or excess > min(gain, MAX_EXCESS * LOSS * count):
+        return None
+    exposure = int(motion.exposure[begins[row]])
+    first, then = sides[side]
+    lost = names[1] if then < first else names[0]
+    frames = abs(then - first)
+    return Finding(
+        Kind.FRAME_LOST,
+        f'fluoroscope {lost} has lost {"a frame" if frames == 1 else f"{frames} frames"} before '
+        f'exposure {exposure}',
+        Place((lost,), (exposure,), name=''),
+        f'add {frames} to the numbers of its frames from {exposure} on',
+        Severity.WARNING,
+        numbers={'exposure': exposure, 'frames': frames},
+    )
+
+
 def delay_finding(names: tuple[str, str], delay: Delay, interval_s: float) -> Finding:
     """Return the warning that the second of two fluoroscopes is delayed.
 
@@ -168,9 +215,8 @@ def _motion(
     both = [exposure for exposure in exposures if a in exposure and b in exposure]
     successive = list(_successive(both, b))
     scale = geometry.essential.ravel() / np.linalg.norm(geometry.essential)
-    parts = [
-        Motion(np.zeros(0, int), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 9)))
-    ]
+    ids, values = np.zeros(0, dtype=np.int64), np.zeros(0)
+    parts = [Motion(ids, ids, np.zeros((0, 3)), values, values, by_rig=np.zeros((0, 9)))]
     steps = np.linspace(0, len(successive) - 1, min(MAX_EXPOSURES, len(successive)))
     for row in steps.astype(int):
         before, exposure, after = successive[row]
@@ -186,10 +232,11 @@ def _motion(
         of_b = found[1].factor_b ** 2 * noise_b
         part = Motion(
             np.asarray(matched.target_id),
+            np.full(len(matched.target_id), exposure[a].number),
             np.column_stack([one.residual for one in found]),
             found[1].factor_a ** 2 * noise_a + of_b,
             of_b,
-            by_rig - np.outer(by_rig @ scale, scale),
+            by_rig=by_rig - np.outer(by_rig @ scale, scale),
         )
         parts.append(chosen_rows(part, np.all(np.isfinite(part.residual), axis=1)))
     return joined_rows(parts)

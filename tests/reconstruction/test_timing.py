@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Delay between the fluoroscopes of a recording."""
+"""Fluoroscopes that are delayed, or have lost a frame."""
 
 import functools
 from dataclasses import replace
@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.jobs.reconstruction import reconstruct
-from fluoro_calib_ros.reconstruction.delay import delay_of
 from fluoro_calib_ros.reconstruction.reconstruct import pair_recording
+from fluoro_calib_ros.reconstruction.timing import timing_fault
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
@@ -53,7 +53,7 @@ def recorded(steps, names='ab', seed=4, seconds=2.0):
 def found(frames, names='ab', orientation=None):
     calibrations, known_orientation = known(names)
     exposures, _ = pair_recording(frames, list(names), RecordedPairing())
-    return delay_of(exposures, calibrations, orientation or known_orientation)
+    return timing_fault(exposures, calibrations, orientation or known_orientation)
 
 
 @pytest.mark.parametrize('names', ['ab', 'abc'])
@@ -106,6 +106,23 @@ def test_a_moved_fluoroscope_is_no_delay():
     assert found(recorded(0), orientation=moved) is None
 
 
+def without(frames, name, lost):
+    """Frames of which a fluoroscope has lost one, numbered without a gap."""
+    kept = [replace(f, number=f.number - (f.number > lost)) for f in frames[name]]
+    return {**frames, name: [f for f, old in zip(kept, frames[name]) if old.number != lost]}
+
+
+@pytest.mark.parametrize('name', ['a', 'b'])
+def test_a_lost_frame_is_named(name):
+    finding = found(without(recorded(0), name, 60))
+    assert finding.kind is Kind.FRAME_LOST and finding.place.fluoroscopes == (name,)
+    assert finding.numbers == {'exposure': 60, 'frames': 1}
+
+
+def test_a_lost_frame_is_not_named_beside_another_fault():
+    assert found(dented(without(recorded(0), 'b', 60))) is None
+
+
 def test_points_at_rest_and_short_recordings_tell_nothing():
     frames = recorded(2)
     still = {name: [replace(f, uv=fs[0].uv) for f in fs] for name, fs in frames.items()}
@@ -116,5 +133,5 @@ def test_points_at_rest_and_short_recordings_tell_nothing():
 def test_reconstruction_of_a_recording_tells_the_delay():
     calibrations, orientation = known()
     outcome = reconstruct(recorded(1), calibrations, orientation)
-    assert outcome.delay.kind is Kind.FRAMES_DELAYED
-    assert reconstruct(recorded(0), calibrations, orientation).delay is None
+    assert outcome.timing.kind is Kind.FRAMES_DELAYED
+    assert reconstruct(recorded(0), calibrations, orientation).timing is None

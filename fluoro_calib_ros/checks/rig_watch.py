@@ -265,6 +265,15 @@ class DriftVerdict:
         """Finding as a sentence."""
         return self.finding.sentence
 
+    def beside(self, timing: Finding | None) -> DriftVerdict:
+        """Return the verdict beside a fault of the timing, which would look like a drift."""
+        if timing is None:
+            return self
+        cause = 'the fluoroscopes are not synchronous, a drift cannot be detected'
+        return DriftVerdict(
+            Finding(Kind.NOT_WATCHED, cause, severity=WARN), widening=self.widening
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class RigEvidence:

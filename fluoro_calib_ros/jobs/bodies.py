@@ -43,7 +43,6 @@ from ..options import option
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.epipolar import why_rays_miss
 from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import (
@@ -52,9 +51,8 @@ from ..reconstruction.reconstruct import (
     orientation_of_recorded,
     pair_recording,
 )
-from ..reconstruction.timing import timing_fault
 from .image_sources import fluoroscope_folders, is_image_bag, open_sources
-from .reconstruction import check_orientation
+from .reconstruction import check_orientation, check_rays
 
 FILM_HZ = 25.0  # slow motion, because players cannot show 250 images per second
 
@@ -419,11 +417,7 @@ def intersected(
         raise DataError(
             'the exposures have no times, or times out of order; give the rate of the recording'
         )
-    finding = why_rays_miss(
-        out, frames, calibrations, intersector, pairing=options, widening=scatter.factor
-    )
-    if finding is not None:
-        raise DataError(finding)
+    timing = check_rays(out, frames, calibrations, intersector, options, widening=scatter.factor)
     disagreement = ''
     if timed and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
@@ -431,11 +425,11 @@ def intersected(
         out,
         sides=np.array([float(max(sizes[name])) for name in names]),
         unpaired=unpaired,
-        drift=watch.verdict(),
+        drift=watch.verdict().beside(timing),
         disagreement=disagreement,
         widening=scatter.factor,
         noise=noise,
-        timing=timing_fault(paired, calibrations, orientation),
+        timing=timing,
     )
 
 

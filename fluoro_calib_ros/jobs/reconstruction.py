@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,7 @@ from ..io.bodies import point_table
 from ..options import option
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.epipolar import why_rays_miss
+from ..reconstruction.epipolar import ExposurePoints, why_rays_miss
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.lost_targets import lost_targets
 from ..reconstruction.observed_noise import with_observed_noise
@@ -160,16 +160,15 @@ def reconstruct(
     )
     if not reconstructed:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
-    finding = why_rays_miss(
-        reconstructed, frames, calibrations, intersector, pairing=options, widening=scatter.factor
+    timing = check_rays(
+        reconstructed, frames, calibrations, intersector, options, widening=scatter.factor
     )
-    if finding is not None:
-        raise DataError(finding)
     lost = lost_targets(reconstructed, frames, calibrations, intersector, options)
     disagreement = ''
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
     drift = watch.verdict() if watch else drift
+    drift = drift and drift.beside(timing)
     return ReconstructionOutcome(
         reconstructed,
         unpaired,
@@ -179,8 +178,38 @@ def reconstruct(
         widening=scatter.factor,
         lost_targets=tuple(lost),
         noise=noise,
-        timing=timing_fault(pair_recording(frames, names, options)[0], calibrations, orientation),
+        timing=timing,
     )
+
+
+def check_rays(
+    reconstruction: Sequence[ExposurePoints],
+    frames: Frames,
+    calibrations: Calibrations,
+    intersector: Intersector,
+    pairing: RecordedPairing,
+    widening: float,
+) -> Finding | None:
+    """Return the fault of the timing of a recording, or None.
+
+    The parameters are those of `why_rays_miss`. Raises DataError if the reconstruction is
+    implausible.
+    """
+    orientation = intersector.orientation
+    exposures, _ = pair_recording(frames, orientation.fluoroscopes, pairing)
+    timing = timing_fault(exposures, calibrations, orientation)
+    finding = why_rays_miss(
+        reconstruction,
+        frames,
+        calibrations,
+        intersector,
+        pairing=pairing,
+        widening=widening,
+        timing=timing,
+    )
+    if finding is not None:
+        raise DataError(finding)
+    return timing
 
 
 def check_orientation(orientation: RigOrientation, calibrations: Calibrations) -> None:

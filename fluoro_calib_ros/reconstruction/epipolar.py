@@ -279,12 +279,18 @@ def why_rays_miss(
     intersector: Intersector,
     pairing: RecordedPairing,
     widening: float,
+    timing: Finding | None = None,
 ) -> Finding | None:
     """Return why a reconstruction is implausible, or None if nothing is wrong with it.
 
     widening: factor by which the rays miss each other by more than expected. If they miss by a
-    little, a reason is returned only if a trial identifies it.
+    little, a reason is returned only if a trial identifies it. timing: fault of the timing, which
+    is the reason if there is one.
     """
+    if timing is not None:
+        share, total = share_rejected(reconstruction)
+        most_miss = total >= MIN_POINTS and share > MAX_REJECTED
+        return missing_rays(share, timing) if most_miss else None
     finding = mismatch(reconstruction, frames, calibrations, intersector, pairing)
     if finding is None and widening >= MAX_WIDENING:
         finding = cause_of_misses(reconstruction, frames, calibrations, intersector, pairing)

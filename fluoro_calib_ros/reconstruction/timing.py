@@ -30,7 +30,7 @@ from .reconstruct import corrected_view, match_views
 
 MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
 MIN_SIGMAS = 5.0  # minimum delay over its standard deviation: one in a million by chance
-MAX_FRAMES = 1.0  # maximum delay: neighbouring frames do not show the motion beyond them
+MAX_FRAMES = 1.0  # maximum delay: neighbouring frames show no motion beyond them
 # Minimum share of the squared misses, beyond their noise and what a changed rig explains, that a
 # delay explains: it is their main cause. Without a delay, unknown distortions of 0.3 to 3 px were
 # explained to 0.13 at most; half an interval beside one of 0.3 px was to 0.79 at least.
@@ -102,8 +102,13 @@ class Delay:
     @property
     def is_cause(self) -> bool:
         """Whether it is significant, and the main cause of the residuals."""
-        is_significant = MIN_SIGMAS * self.sd < abs(self.frames) < MAX_FRAMES
+        is_significant = self.margin < abs(self.frames) < MAX_FRAMES + self.margin
         return is_significant and self.explained > MIN_EXPLAINED
+
+    @property
+    def margin(self) -> float:
+        """Largest error of the delay."""
+        return MIN_SIGMAS * self.sd
 
 
 def fitted_delay(motion: Motion) -> Delay | None:
@@ -187,6 +192,19 @@ def delay_finding(names: tuple[str, str], delay: Delay, interval_s: float) -> Fi
     """
     first, name = names
     size = abs(delay.frames)
+    if size + delay.margin > 1:
+        shift = -1 if delay.frames > 0 else 1
+        cause = (
+            f'the frame numbers of fluoroscope {name} are too {"small" if shift < 0 else "large"} '
+            'by 1'
+        )
+        return Finding(
+            Kind.FRAMES_SHIFTED,
+            cause,
+            Place((name,), name=''),
+            severity=Severity.WARNING,
+            numbers={'shift': shift},
+        )
     time = f' ({1e3 * interval_s * size:.1f} ms)' if interval_s else ''
     return Finding(
         Kind.FRAMES_DELAYED,

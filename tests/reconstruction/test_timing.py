@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import true_calibrations, true_orientation
+from rigs import refused, true_calibrations, true_orientation
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.exposures.pairing import RecordedPairing
@@ -37,9 +37,9 @@ def known(names='ab'):
 
 
 @functools.cache
-def recorded(steps, names='ab', seed=4, seconds=2.0):
+def recorded(steps, names='ab', seed=4, seconds=2.0, rate_hz=RATE_HZ):
     """Frames of which those of the last fluoroscope are late by quarters of a frame interval."""
-    tracking = simulate_tracking(rig(), seconds, 4 * RATE_HZ, seed=seed, noise_px=NOISE_PX)
+    tracking = simulate_tracking(rig(), seconds, 4 * rate_hz, seed=seed, noise_px=NOISE_PX)
     late = {name: steps if name == names[-1] else 0 for name in names}
     return {
         name: [
@@ -64,6 +64,15 @@ def test_a_fluoroscope_that_is_late_or_early_is_named(steps, names):
     assert finding.place.fluoroscopes == ('a', names[-1])
     assert abs(finding.numbers['frames'] - steps / 4) < 4 * finding.numbers['sd'] < 0.1
     assert finding.numbers['interval_s'] == pytest.approx(1 / RATE_HZ, rel=1e-6)
+
+
+@pytest.mark.parametrize('shift', [1, -1])
+def test_frame_numbers_that_are_off_by_one_are_named(shift):
+    frames = recorded(0)
+    renumbered = [replace(frame, number=frame.number + shift) for frame in frames['b']]
+    finding = found({**frames, 'b': renumbered})
+    assert (finding.kind, finding.place.fluoroscopes) == (Kind.FRAMES_SHIFTED, ('b',))
+    assert finding.numbers == {'shift': shift}
 
 
 def test_the_standard_deviation_is_that_of_repetitions():
@@ -134,4 +143,11 @@ def test_reconstruction_of_a_recording_tells_the_delay():
     calibrations, orientation = known()
     outcome = reconstruct(recorded(1), calibrations, orientation)
     assert outcome.timing.kind is Kind.FRAMES_DELAYED
+    assert outcome.drift.finding.kind is Kind.NOT_WATCHED
     assert reconstruct(recorded(0), calibrations, orientation).timing is None
+
+
+def test_a_delay_is_the_cause_if_most_rays_miss():
+    calibrations, orientation = known()
+    with refused(Kind.FRAMES_DELAYED):
+        reconstruct(recorded(2, seconds=12.0, rate_hz=5.0), calibrations, orientation)

@@ -52,7 +52,12 @@ KINDS = (slice(0, 3), slice(3, 6))  # components of a pose: position, rotation
 
 # For a body that appears: wide enough for any motion of a living joint. A fall from 2 m ends at
 # 6 m/s, a golf swing rotates the forearm at 40 rad/s; impacts reach 100 g and 5000 rad/s^2.
-START_SD = np.repeat([0.0, 6e3, 1e6], 6) * np.tile(np.repeat([1.0, 1 / 150], 3), 3)
+RADIAN_MM = 150.0  # shift of a body for a radian of its rotation
+START_SD = np.repeat([0.0, 6e3, 1e6], 6) * np.tile(np.repeat([1.0, 1 / RADIAN_MM], 3), 3)
+# Variance of a rotation of which nothing is known, uniform within half a turn [rad^2]: two exposures
+# do not show more turns. Velocity, acceleration and jerk of a body that appears may each move it as
+# far until the next exposure, at most.
+UNKNOWN_RAD2 = np.pi**2 / 3
 # Log of the density of jerk of a body that appears, [mm^2/s^5] and [rad^2/s^5], and its standard
 # deviation: from a body at rest (a jerk of 1 mm/s^3 for 1 s) to an impact (1e8 mm/s^3 for 1 ms).
 START_LOG = np.array([18.0, 8.0])
@@ -222,6 +227,8 @@ class MotionFilter:
     def predict(self, dt_s: float, log_q: NDArray[np.float64] | None = None) -> None:
         """Predict the next exposure, dt_s later; log_q (B, 2): given densities, if any."""
         count = len(self.alive)
+        if self.steps and self.steps[-1].started.any():
+            self._limit_start(dt_s, self.steps[-1])
         if log_q is not None:
             self.log_q = log_q
         turn = dt_s * self.mean[:, 9:12] + dt_s**2 / 2 * self.mean[:, 15:18]
@@ -310,6 +317,18 @@ class MotionFilter:
         self.log_q = np.where(start[:, None], START_LOG, self.log_q)
         self._log_variance[start] = START_LOG_SD**2
         self._slope[start] = 0
+
+    def _limit_start(self, dt_s: float, step: _Step) -> None:
+        """Limit what bodies that have just appeared may do in dt_s, see UNKNOWN_RAD2."""
+        dt_s = max(dt_s, 1e-9)  # stamps are in ns
+        reach = np.sqrt(UNKNOWN_RAD2) * np.repeat([RADIAN_MM, 1.0], 3)
+        limit = np.concatenate([np.zeros(6), reach / dt_s, 2 * reach / dt_s**2])
+        variance = np.minimum(START_SD, limit) ** 2
+        state = np.arange(6, STATE)
+        for covariance in (step.covariance, self.covariance):
+            covariance[np.ix_(step.started, state, state)] = np.diag(variance[6:])
+        log_q = np.minimum(START_LOG, np.log(reach[::3] ** 2 / noise_factors(dt_s)[0, 0]))
+        self.log_q = np.where(step.started[:, None], log_q, self.log_q)
 
     def _adapt(self, step: _Step, seen: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
         """Improve the log densities with the likelihood of an exposure.
@@ -492,7 +511,7 @@ def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion
     log_q = np.stack([step.log_q for step in steps])
     walk = np.full(log_q.shape[1:], WALK)
     motion, scores = _smooth(steps)
-    for _ in range(12):
+    for _ in range(12 if len(steps) > 1 else 0):  # one exposure shows no change
         log_q, change, walk = _improved(log_q, scores, dt, walk)
         follower = MotionFilter(len(first.alive), lag=None)
         for k, step in enumerate(steps):

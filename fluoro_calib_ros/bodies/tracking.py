@@ -20,18 +20,21 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..exposures.stamps import NS_PER_S
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..photogrammetry.rotations import cross_matrix
+from ..photogrammetry.rotations import cross_matrix, rotation_angle
 from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
 from ..rows import joined_rows
 from .body import Body, BodyPoses, PoseStatus
 from .joints import Joint, JointMotion, JointStatus, joint_motion, with_neutral
-from .motion import POSE, Motion, MotionFilter, smooth_trial
+from .motion import POSE, UNKNOWN_RAD2, Motion, MotionFilter, smooth_trial
 from .pose import FramePoses, PoseSolver, Prediction
 
 # Standard deviation of a predicted rotation beyond which the prediction cannot locate markers: at
 # 20 mm from the centre it is as far as the next marker.
 LOST_SD_RAD = 0.3
+# Rotation from the predicted to the seen pose beyond which a filter, which is linear about its
+# prediction, fails: the second-order part is half of the first. Such a body appears anew.
+ELSEWHERE_RAD = 1.0
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,10 @@ class BodyTracker:
         frame = self.solver.solve(exposure, expected)
         self._weak = np.where(frame.alone, 0, expected.weak)
         # A body that has just appeared has no useful prediction yet, as its speed is unknown.
-        self.filter.lose(~expected.known & ~frame.alone)
+        variance = np.diagonal(expected.covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
+        angle = rotation_angle(frame.rotation @ np.swapaxes(expected.rotation, 1, 2))
+        is_elsewhere = (variance > 3 * UNKNOWN_RAD2) | (angle > ELSEWHERE_RAD)
+        self.filter.lose(is_elsewhere | (~expected.known & ~frame.alone))
         self.filter.update(frame.information, frame.alone & ~self.filter.alive)
         self._keep(number, stamp_ns, frame)
         if self.lag is None or len(self._taken) <= self.lag:

@@ -194,6 +194,45 @@ def test_live_and_recorded_with_the_same_lag_are_the_same_bytes():
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
 
 
+@pytest.mark.parametrize(
+    ('times_s', 'rad'),
+    [
+        (0.1 * np.arange(40), 0.0),
+        (0.15 * np.arange(40), 1.3),
+        (0.5 * np.arange(40), 0.5),
+        (10.0 * np.arange(20), 0.02),
+        (0.01 * np.arange(40) + 1e3 * (np.arange(40) >= 20), 0.01),
+        ([0.0], 0.0),
+    ],
+)
+def test_poses_far_apart_in_time_are_as_good_as_each_alone(times_s, rad):
+    """Low rates, a long gap, and a single exposure; rad: rotation from one exposure to the next."""
+    rng = np.random.default_rng(3)
+    rig = orientation()
+    bone = body(rng, 4, 'femur', 1)
+    k = np.arange(len(times_s))
+    turn = Rotation.from_rotvec(np.outer(rad * k, [0.6, 0.8, 0])).as_matrix()
+    place = np.outer(np.sin(rad * k), [30, 20, 10])
+    tracker = BodyTracker(rig, [bone], lag=None)
+    live = BodyTracker(rig, [bone], lag=2)
+    lagged = []
+    for number, time_s in enumerate(times_s):
+        points = bone.xyz_mm @ turn[number].T + place[number]
+        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+        given = exposure(rig, bone.target_id, uv, Noise(0.2)), number, 1 + round(1e9 * time_s)
+        tracker.add(*given)
+        lagged.append(live.add(*given))
+    lagged = [one for one in lagged if one is not None] + live.flush()
+    for tracked in (tracker.smoothed(), lagged):
+        (found,) = poses_of([bone], tracked)
+        (alone,) = poses_alone([bone], tracked)
+        assert (found.status == PoseStatus.OK).all()
+        assert (found.sd <= 1.001 * alone.sd).all()
+        assert (np.abs(found.position_mm - place) < 5 * found.sd[:, :3]).all()
+        error = vector_from_matrix(found.rotation @ np.swapaxes(turn, 1, 2))
+        assert (np.abs(error) < 5 * found.sd[:, 3:]).all()
+
+
 def test_an_exposure_that_is_not_later_is_not_taken():
     trial = Trial(5, count=3)
     tracker = BodyTracker(trial.rig, trial.bodies)

@@ -244,15 +244,19 @@ def _start(body: Body, places: BodyPlaces) -> tuple[NDArray[np.float64], NDArray
     reference = int(np.argmax(seen.sum(axis=1))) if len(seen) else 0
     if not len(seen) or np.count_nonzero(seen[reference]) < min_markers:
         return None
-    xyz = np.where(seen[reference][:, None], places.xyz_mm[reference], np.nan)
-    for marker in np.flatnonzero(~seen[reference]):
-        for place in places.xyz_mm[seen[:, marker]]:
-            in_both = np.isfinite(place).all(axis=1) & np.isfinite(xyz).all(axis=1)
-            if np.count_nonzero(in_both) >= 3:
-                rotation, shift = fitted_pose(place[in_both], xyz[in_both])
-                xyz[marker] = rotation @ place[marker] + shift
-                break
-    is_placed = np.isfinite(xyz).all(axis=1)
+    xyz = places.xyz_mm[reference].copy()
+    is_placed = seen[reference].copy()
+    # The exposure with the most markers in common with those placed so far places the others.
+    while len(row := np.flatnonzero((seen & ~is_placed).any(axis=1))):
+        common = np.count_nonzero(seen[row] & is_placed, axis=1)
+        nearest = row[np.argmax(common)]
+        if common.max() < 3:
+            break
+        both, new = seen[nearest] & is_placed, seen[nearest] & ~is_placed
+        place = places.xyz_mm[nearest]
+        rotation, shift = fitted_pose(place[both], xyz[both])
+        xyz[new] = place[new] @ rotation.T + shift
+        is_placed |= new
     has_ct = is_placed & body.known & np.isfinite(body.sd_mm)
     if np.count_nonzero(has_ct) >= 3:
         rotation, shift = fitted_pose(xyz[has_ct], body.xyz_mm[has_ct])
@@ -699,6 +703,8 @@ def _against_others(
     arm = np.concatenate([ct[others], ct[[marker]]]) - ct[others].mean(axis=0)
     motion = by_pose(arm)
     normal = (np.swapaxes(motion[:-1], 1, 2) @ (motion[:-1] * weight[:, None, None])).sum(axis=0)
+    # Others on a line leave a rotation free, which is then uncertain.
+    normal += REGULAR * normal.max() * np.eye(POSE_SIZE)
     deviation = rotation @ adjusted[marker] + shift - ct[marker]
     covariance = sd[marker] ** 2 * np.eye(3) + motion[-1] @ np.linalg.solve(normal, motion[-1].T)
     return float(deviation @ np.linalg.solve(covariance, deviation))

@@ -219,3 +219,28 @@ def test_a_body_that_is_never_seen_stays_as_it_is():
     shape = estimate_shape(given, nothing)
     assert kinds(shape.findings) == [Kind.BODY_UNSEEN]
     assert (shape.body.xyz_mm == given.xyz_mm).all()
+
+
+def test_markers_are_placed_whatever_their_numbers():
+    """Some are seen only with markers that are themselves placed by a later exposure."""
+    rng = np.random.default_rng(8)
+    xyz = rng.uniform(-30, 30, (7, 3))
+    shown = [(2, 3, 4, 5, 6)] * 3 + [(0, 1, 2, 3)] * 3 + [(1, 2, 3, 4)] * 3
+    for order in (np.arange(7), np.arange(7)[::-1]):
+        places = np.full((len(shown), 7, 3), np.nan)
+        for row, markers in zip(places, shown):
+            turn = Rotation.random(random_state=rng).as_matrix()
+            row[order[list(markers)]] = xyz[list(markers)] @ turn.T + rng.normal(0, 0.02, 3)
+        covariance = np.broadcast_to(4e-4 * np.eye(3), (*places.shape, 3))
+        shape = estimate_shape(unknown(7), BodyPlaces(places, covariance, 0 * covariance))
+        assert shape.body.known.all()
+        assert np.abs(relative_errors(shape, xyz[np.argsort(order)])).max() < 0.2
+
+
+def test_marker_is_compared_with_three_others_on_a_line():
+    """Also exactly on an axis of CT: the rotation about it is free."""
+    rng = np.random.default_rng(9)
+    ct = np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0], [10, 15, 0]])
+    shape = estimate_shape(by_ct(rng, ct, 0.0), recording(rng, ct, 40))
+    assert not shape.findings
+    assert np.abs(relative_errors(shape, ct)).max() < 0.1

@@ -465,12 +465,8 @@ def _unwrapped(
     unwrapped = angles[determined]
     # Count whole turns, so that processing one exposure at a time gives the same values.
     turns = -np.cumsum(_turns(np.diff(unwrapped, axis=0, prepend=unwrapped[:1])), axis=0)
-    if before is not None:
-        start = np.asarray(before, dtype=float)
-        turns = turns - _turns(unwrapped[:1] - start)
-    else:
-        start = unwrapped[0] if len(unwrapped) else np.zeros(3)
-    unwrapped = unwrapped + 2 * np.pi * turns
+    start = np.zeros(3) if before is None else np.asarray(before, dtype=float)
+    unwrapped = unwrapped + 2 * np.pi * (turns - _turns(unwrapped[:1] - start))
     out = np.concatenate([start[None], unwrapped])[np.cumsum(determined)]
     near_lock = known & ~determined
     out[near_lock] = angles[near_lock] - 2 * np.pi * _turns(angles[near_lock] - out[near_lock])

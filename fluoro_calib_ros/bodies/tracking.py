@@ -281,14 +281,14 @@ def twists_of(
 def poses_alone(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
     """Return the poses that each exposure gives alone, without a filter."""
     frames = [exposure.frame for exposure in exposures]
-    is_determined = _by_body(frames, 'alone')
+    status = np.where(_by_body(frames, 'ambiguous'), PoseStatus.AMBIGUOUS, PoseStatus.OK)
     return _poses(
         bodies,
         exposures,
         pose=(_by_body(frames, 'rotation'), _by_body(frames, 'centre_mm')),
         noise=_by_body(frames, 'covariance_noise'),
         fixed=_by_body(frames, 'covariance_fixed'),
-        status=np.where(is_determined, PoseStatus.OK, PoseStatus.FAILED).astype(np.uint8),
+        status=np.where(_by_body(frames, 'alone'), status, PoseStatus.FAILED).astype(np.uint8),
     )
 
 

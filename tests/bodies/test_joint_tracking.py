@@ -118,3 +118,16 @@ def test_neutral_trial_that_is_too_long_is_refused():
     with pytest.raises(DataError, match='10000'):
         JointTracker(JOINT, (1, MAX_NEUTRAL + 1))
     JointTracker(JOINT, (1, MAX_NEUTRAL))
+
+
+def test_angles_near_the_lock_before_any_other_are_counted_from_zero_as_in_the_whole_trial():
+    joint = Joint('knee', 'femur', 'tibia', 'euler_xyx')
+    tibia = poses('tibia', np.zeros((4, 3)))
+    degrees = [[170, 0.1, 0], [175, 0.1, 0], [-178, 20, 0], [-160, 40, 0]]
+    turns = Rotation.from_euler('XYX', degrees, degrees=True).as_matrix()
+    trial = poses('femur', np.zeros((4, 3))), replace(tibia, rotation=turns)
+    expected = joint_motion(joint, *trial)
+    assert expected.determined.tolist() == [False, False, True, True]
+    np.testing.assert_allclose(np.degrees(expected.angles[:2, 0]), [170, 175])
+    found = one_by_one(JointTracker(joint), trial)
+    assert np.allclose(np.concatenate([one.angles for one in found]), expected.angles, atol=1e-12)

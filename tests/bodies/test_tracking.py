@@ -10,7 +10,7 @@ import pytest
 from body_views import Noise, body, exposure, orientation, project
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.bodies.body import PoseStatus
+from fluoro_calib_ros.bodies.body import Body, PoseStatus
 from fluoro_calib_ros.bodies.butterworth import filtered_poses
 from fluoro_calib_ros.bodies.tracking import BodyTracker, poses_alone, poses_of
 from fluoro_calib_ros.errors import DataError
@@ -317,3 +317,23 @@ def test_predictions_do_not_change_what_an_exposure_says():
         found = plain.add(one, number, stamp_ns), asked.add(one, number, stamp_ns)
         np.testing.assert_array_equal(found[0].centre_mm, found[1].centre_mm)
         np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
+
+
+@pytest.mark.parametrize('blind', [False, True])
+def test_a_pose_alone_is_ambiguous_if_another_one_fits_as_well(blind):
+    """Of a flat body that one view sees; also without a filter."""
+    rng = np.random.default_rng(11)
+    rig = orientation()
+    corners = np.array([[-10.0, -10, 0], [10, -9, 0], [9, 11, 0], [-11, 8, 0]])
+    flat = Body('patella', np.arange(4), corners - corners.mean(axis=0), np.zeros(4))
+    turn = rig.rotation[0].T @ Rotation.from_rotvec([0.35, 0.1, 0]).as_matrix()
+    tracker = BodyTracker(rig, [flat])
+    tracked = []
+    for k, time_s in enumerate([0.0, 0.005]):
+        uv = project(rig, flat.xyz_mm @ turn.T) + rng.normal(0, 0.2, (2, 4, 2))
+        if k and blind:
+            uv[1] = np.nan
+        given = exposure(rig, flat.target_id, uv, Noise(0.2))
+        tracked.append(tracker.add(given, k, 1 + round(1e9 * time_s)))
+    expected = PoseStatus.AMBIGUOUS if blind else PoseStatus.OK
+    assert tracked[1].status[0] == poses_alone([flat], tracked)[0].status[1] == expected

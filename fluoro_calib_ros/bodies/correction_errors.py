@@ -29,7 +29,8 @@ def covariance_of_means(uv: NDArray[np.float64]) -> NDArray[np.float64]:
         counts = np.array([len(sample) for sample in samples])
         marker = np.repeat(np.arange(len(counts)), counts)
         share = (marker == np.arange(len(counts))[:, None]) / np.maximum(counts, 1)[:, None]
-        out.append(share @ np.exp(-cdist(points, points) / REACH) @ share.T)
+        sums = [np.exp(-cdist(sample, points) / REACH).sum(axis=0) for sample in samples]
+        out.append(np.array(sums) @ share.T / np.maximum(counts, 1)[:, None])
     return np.array(out)
 
 

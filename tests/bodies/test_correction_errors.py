@@ -3,6 +3,8 @@
 
 """Correction errors of moving markers: what the mean errors have in common."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -100,3 +102,13 @@ def test_learned_shapes_scatter_as_claimed_where_corrections_have_errors():
         squares.append(np.mean((axes[:, 6:].T @ away) ** 2 / variance[6:]))
     # 30 shapes with 6 parameters each: the mean has a standard deviation of 0.1.
     assert 0.65 < np.mean(squares) < 1.35
+
+
+def test_means_of_many_markers_need_little_memory():
+    """Of 40 markers, as in a hand; all pairs of their samples would take 128 MB."""
+    uv = np.random.default_rng(4).uniform(0, 1, (100, 40, 1, 2))
+    tracemalloc.start()
+    covariance_of_means(uv)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 30e6

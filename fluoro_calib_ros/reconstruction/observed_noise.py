@@ -136,8 +136,9 @@ def _residuals(
     exposure: Mapping[str, Frame], calibrations: Calibrations, orientation: RigOrientation
 ) -> _Residuals:
     """Return the epipolar residuals of all pairs of views within the calibrated areas."""
-    names = [name for name in orientation.fluoroscopes if name in exposure]
-    views = match_views([corrected_view(exposure[name], calibrations[name]) for name in names])
+    names = orientation.fluoroscopes
+    frames = [exposure.get(name) for name in names]
+    views = match_views([f and corrected_view(f, calibrations[f.fluoroscope]) for f in frames])
     noise = np.sqrt(np.maximum(views.sigma**2 - views.correction_sd**2, 0.0))
     widths = [calibrations[name].image_size[0] for name in names]
     parts = []

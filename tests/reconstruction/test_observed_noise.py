@@ -17,7 +17,12 @@ from fluoro_calib_ros.jobs.bodies import track_bodies
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.observed_noise import with_observed_noise
-from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    StreamStart,
+    image_frames,
+    simulate_tracking,
+    virtual_rig,
+)
 
 BEADS_PX = 0.05  # noise of the image points of the calibration
 RATE_HZ = 100.0
@@ -134,3 +139,33 @@ def test_bodies_of_imprecise_markers_are_rigid():
     assert outcome.noise.kind is Kind.NOISE_OBSERVED and not outcome.findings
     (poses,) = outcome.poses
     assert poses.known.mean() > 0.99
+
+
+def test_residuals_of_different_views_are_not_compared():
+    """Of markers in the middle of all images, of which one is missing in turn."""
+    made, calibrations, orientation = rig('abc')
+    points = np.random.default_rng(7).uniform(-12, 12, (8, 3))
+    frames, _ = image_frames(
+        made,
+        np.broadcast_to(points, (200, 8, 3)),
+        np.arange(1, 9),
+        (np.arange(200) / RATE_HZ).tolist(),
+        noise_px=BEADS_PX,
+        rng=np.random.default_rng(3),
+        start=StreamStart(),
+    )
+    sd = np.tile(np.repeat([0.3, 5e-4, 0.1], 3), 3)
+    some = {
+        name: [frame for frame in of_view if 'abc'[frame.number % 3] != name]
+        for name, of_view in frames.items()
+    }
+    for seed in range(5):
+        wrong = (np.random.default_rng(seed).normal(size=27) * sd).reshape(3, 9)
+        moved = replace(
+            orientation,
+            position_mm=orientation.position_mm + wrong[:, :3],
+            rotation=matrix_from_vector(wrong[:, 3:6]) @ orientation.rotation,
+            covariance=np.diag(sd**2),
+        )
+        for given in (frames, some):
+            assert with_observed_noise(given, calibrations, moved)[1] is None

@@ -45,7 +45,7 @@ from .intersection import (
     IntersectedPoints,
     Intersector,
 )
-from .reconstruct import reconstruct_recording
+from .reconstruct import numbered_by_exposure, reconstruct_recording
 
 MIN_BASE = 1e-6  # minimum distance of the sources over their distance from the origin of the rig
 
@@ -312,6 +312,7 @@ def mismatch(
     if total < MIN_POINTS or share <= MAX_REJECTED:
         return None
     names = intersector.orientation.fluoroscopes
+    frames = numbered_by_exposure(frames, names, pairing)
     for cause, changed in _trials(frames, names, _largest(reconstruction)):
         reconstructed, _ = reconstruct_recording(changed, calibrations, intersector, pairing)
         rejected, count = share_rejected(reconstructed)
@@ -332,6 +333,7 @@ def cause_of_misses(
     The trials are those of `mismatch`, and image points that are already corrected.
     """
     names = intersector.orientation.fluoroscopes
+    frames = numbered_by_exposure(frames, names, pairing)
     numbers = _largest(reconstruction)
     limit = CLOSER * _miss([frame for frame in reconstruction if frame.number in numbers])
     uncorrected = {

@@ -22,7 +22,7 @@ from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
 from .epipolar import BETTER, MAX_REJECTED, MAX_TRIED, MIN_POINTS
 from .intersection import FAILED, OK, OUTSIDE, REJECTED, Intersector
-from .reconstruct import ReconstructedFrame, reconstruct_recording
+from .reconstruct import ReconstructedFrame, numbered_by_exposure, reconstruct_recording
 
 MAX_PAIRED = 8  # targets of which each pair is tried: 28 pairs
 
@@ -40,6 +40,7 @@ def lost_targets(
     """
     names = intersector.orientation.fluoroscopes
     lost = _lost(reconstruction)
+    frames = numbered_by_exposure(frames, names, pairing) if len(lost) > 1 else frames
     findings = []
     for pair in combinations(lost[:MAX_PAIRED], 2):
         if not set(pair) <= set(lost):

@@ -299,6 +299,17 @@ def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigO
     return orientation.subset(names)
 
 
+def numbered_by_exposure(frames: Frames, names: Sequence[str], pairing: RecordedPairing) -> Frames:
+    """Return the frames of a recording with the numbers of its exposures, see ReconstructedFrame.
+
+    Frames that are paired by stamp may be numbered differently, or not at all.
+    """
+    if pairing.pair_by == 'frame_number':
+        return frames
+    exposures, _ = pair_recording(frames, names, pairing)
+    return {name: [frame[name] for frame in exposures if name in frame] for name in names}
+
+
 def pair_recording(
     frames: Frames, names: Sequence[str], pairing: RecordedPairing
 ) -> tuple[list[dict[str, Frame]], dict[str, int]]:

@@ -387,6 +387,29 @@ def test_shift_that_is_found_is_the_one_that_was_made(field, step):
     assert cause_of_misses(*given).kind is why.kind
 
 
+def by_stamp(of, first):
+    """Frames with stamps; those of b are counted from another number."""
+    return {
+        name: [
+            replace(f, number=f.number + first * (name == 'b'), stamp_ns=(1 + k) * 10**9)
+            for k, f in enumerate(of_view)
+        ]
+        for name, of_view in of.items()
+    }
+
+
+@pytest.mark.parametrize('first', [0, 100])
+def test_causes_are_found_in_frames_that_are_paired_by_stamp(first):
+    options = ReconstructionOptions(pair_by='stamp')
+    with refused(Kind.IMAGE_MIRRORED):
+        reconstruct(by_stamp(changed(upside_down), first), calibrations(), orientation(), options)
+    a, b = (frames()[name][0] for name in 'ab')
+    one, two = np.intersect1d(a.target_id, b.target_id)[[0, 4]].tolist()
+    wrong = {'a': [a] * 24, 'b': [with_ids_of_each_other(one, two)(b)] * 24}
+    found = reconstruct(by_stamp(wrong, first), calibrations(), orientation(), options)
+    assert [one.kind for one in found.lost_targets] == [Kind.TARGETS_EXCHANGED]
+
+
 def test_share_of_rejected_points_is_of_points_of_two_views():
     """Single views have no second ray and do not count; failed points count as rejected."""
     status = np.array([OK] * 3 + [OUTSIDE] + [REJECTED] * 2 + [FAILED] * 4 + [SINGLE_VIEW] * 7)

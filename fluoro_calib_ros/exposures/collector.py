@@ -509,6 +509,8 @@ class _Table:
         self._angle = np.array([np.nan if f.angle is None else f.angle for f in frames])
         for frame_uv, frame in zip(self._uv, frames):
             frame_uv[np.searchsorted(ids, frame.target_id)] = frame.uv
+        self._seen = np.isfinite(self._uv[..., 0]).astype(float)
+        self._count = self._seen.sum(axis=1)
 
     def compare(
         self, number: int, others: NDArray[np.int64]
@@ -520,14 +522,15 @@ class _Table:
             return is_same, is_same.copy()
         row = self._row[number]
         rows = np.array([self._row[other] for other in others[is_present].tolist()])
-        distance = np.linalg.norm(self._uv[rows] - self._uv[row], axis=2)
-        common = np.isfinite(distance)
-        seen_count = np.isfinite(self._uv[..., 0]).sum(axis=1)
-        min_common = SHARE * np.minimum(seen_count[rows], seen_count[row])
-        comparable = common.sum(axis=1) >= np.maximum(MIN_COMMON_TARGETS, min_common)
+        common = self._seen[rows] @ self._seen[row]
+        min_common = SHARE * np.minimum(self._count[rows], self._count[row])
+        comparable = np.flatnonzero(common >= np.maximum(MIN_COMMON_TARGETS, min_common))
+        distance = np.linalg.norm(self._uv[rows[comparable]] - self._uv[row], axis=2)
+        # A median is small only if half of the distances are; few need it.
+        near = 2 * np.count_nonzero(distance <= STILL_PX, axis=1) >= common[comparable]
         is_still = np.zeros(len(rows), dtype=bool)
-        for index in np.flatnonzero(comparable):
-            is_still[index] = np.median(distance[index][common[index]]) <= STILL_PX
+        for index, targets in zip(comparable[near], distance[near]):
+            is_still[index] = np.nanmedian(targets) <= STILL_PX
         is_rotated = np.abs(self._angle[rows] - self._angle[row]) > SAME_ANGLE_RAD
         is_same[is_present] = is_still & ~is_rotated
         return is_same, is_present & ~is_same

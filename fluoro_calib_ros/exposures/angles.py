@@ -140,7 +140,7 @@ class AngleTrack:
 
     def at(self, stamp_ns: int) -> float | None:
         """Return the angle at a time [rad], None if unknown."""
-        self._asked = stamp_ns
+        self._asked = max(stamp_ns, self._asked or 0)
         index = bisect_right(self._stamps, stamp_ns) - 1
         if index < 0 or stamp_ns - self._stamps[index] > self._max_age_ns:
             return None

@@ -167,7 +167,8 @@ class Drawing:
             raise DataError('a drawing needs at least one column, row and layer', kind=Kind.DATA)
         if not all(0 < pitch < np.inf for pitch in self.pitch_mm):
             raise DataError('a pitch must be above 0 mm', kind=Kind.IMPLAUSIBLE_NUMBER)
-        nearest = min(self.pitch_mm[: 1 if self.hexagonal else 3 if self.layers > 1 else 2])
+        x, y, z = self.pitch_mm
+        nearest = min(x, x if self.hexagonal else y, z if self.layers > 1 else x)
         if self.diameter_mm is not None and not 0 < self.diameter_mm < nearest:
             raise DataError(
                 f'a diameter of {self.diameter_mm:g} mm is not between 0 and the pitch, '

@@ -92,12 +92,11 @@ def beams(orientation: RigOrientation) -> list[tuple[str, float, float]]:
     """
     pairs = []
     for i, j in combinations(range(len(orientation.fluoroscopes)), 2):
-        cosine = float(orientation.rotation[i][2] @ orientation.rotation[j][2])
+        axes = orientation.rotation[[i, j], 2]
+        angle = np.arctan2(np.linalg.norm(np.cross(*axes)), axes[0] @ axes[1])
         baseline = orientation.position_mm[i] - orientation.position_mm[j]
         names = f'{orientation.fluoroscopes[i]} and {orientation.fluoroscopes[j]}'
-        pairs.append(
-            (names, float(np.degrees(np.arccos(cosine))), float(np.linalg.norm(baseline)))
-        )
+        pairs.append((names, float(np.degrees(angle)), float(np.linalg.norm(baseline))))
     return pairs
 
 

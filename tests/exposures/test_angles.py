@@ -130,3 +130,12 @@ def test_other_joints_and_states_without_positions_are_ignored():
     assert angles.at('a', 2 * S) is None and angles.at('c', 2 * S) is None
     assert angles.doubt('a', 2 * S) == 'joint frontal: it has no state yet'
     assert angles.doubt('c', 2 * S) == 'parameter angle_joint names no joint'
+
+
+def test_state_is_late_after_any_exposure_that_needed_it():
+    """Also if an earlier exposure, of another fluoroscope, was asked for in the meantime."""
+    found = track([(S, 0.1)])
+    found.at(S + 10)
+    found.at(S + 5)
+    found.add(S + 7, 0.2)
+    assert found.late == 1

@@ -196,3 +196,11 @@ def test_the_command_writes_file_and_picture(tmp_path, capsys):
     assert rigs.run('phantom', '--square', '5', '--pitch', 10, tmp_path / 'no.csv') == 2
     assert rigs.run('phantom', '--square', '5x5', '--pitch', 10) == 2
     assert not (tmp_path / 'no.csv').exists()
+
+
+@pytest.mark.parametrize('hexagonal', [False, True])
+def test_beads_of_neighbouring_layers_do_not_overlap(hexagonal):
+    pitch = (10.0, 10.0, 2.0)
+    with rigs.refused(Kind.IMPLAUSIBLE_NUMBER):
+        Drawing(3, 3, 2, pitch_mm=pitch, hexagonal=hexagonal, diameter_mm=5.0)
+    Drawing(3, 3, pitch_mm=pitch, hexagonal=hexagonal, diameter_mm=5.0)

@@ -17,6 +17,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import NoiseProfile
 from fluoro_calib_ros.exposures.collector import coverage_of
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import OK, REJECTED
 from fluoro_calib_ros.report import html, residuals
 from fluoro_calib_ros.report.figures import (
@@ -419,6 +420,18 @@ def test_beams_meet_at_their_angle():
     assert names == ('a and b', 'a and c', 'b and c')
     assert between == pytest.approx([50, 900, np.hypot(50, 900)])
     assert degrees == pytest.approx(np.degrees(np.arccos([0.6, -1, -0.6])))
+
+
+@pytest.mark.filterwarnings('error')
+def test_parallel_beams_have_an_angle_of_zero():
+    """Rounding may make the product of two equal axes larger than 1."""
+    for seed in range(20):
+        turn = matrix_from_vector(np.random.default_rng(seed).normal(size=3))
+        orientation = Fake(
+            fluoroscopes=('a', 'b'), rotation=np.stack([turn, turn]), position_mm=np.eye(2, 3)
+        )
+        ((_, degrees, _),) = beams(orientation)
+        assert degrees == pytest.approx(0, abs=1e-6)
 
 
 def test_share_of_the_image_that_is_not_calibrated():

@@ -62,7 +62,7 @@ def _series(
     """Return a figure of six time series (T, 6) with their standard deviations."""
     values, sd = series
     time_s = (source.stamp_ns - source.stamp_ns[0]) / 1e9
-    filled = ~np.isin(source.status, (PoseStatus.OK, PoseStatus.WEAK))
+    filled = np.isin(source.status, (PoseStatus.FILLED, PoseStatus.FAILED))
     with matplotlib.rc_context(STYLE):
         figure = new_figure(10, 6, title)
         axes = figure.subplots(2, 3, sharex=True)
@@ -84,7 +84,7 @@ def _series(
             panel.set_xlabel('time [s]')
         figure.supxlabel(
             f'band: {BAND:g} standard deviations of all errors'
-            + ('; grey: predicted, no marker was seen' if filled.any() else ''),
+            + ('; grey: predicted, no marker was seen, or no pose' if filled.any() else ''),
             fontsize=9,
         )
     return figure

@@ -3,12 +3,14 @@
 
 """Figures draw what the model predicts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import BodyPoses, PoseStatus
-from fluoro_calib_ros.bodies.joints import Joint, joint_motion
+from fluoro_calib_ros.bodies.joints import Joint, JointStatus, joint_motion
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.report.figures import (
     Scale,
@@ -158,3 +160,13 @@ def test_paths_of_bodies_have_axes_where_they_are():
     np.testing.assert_allclose(
         (ends[:, :, 1] - ends[:, :, 0]).T, length * tibia.rotation[3], atol=1e-12
     )
+
+
+def test_only_times_without_a_marker_are_grey():
+    """Neither ambiguous poses nor those near gimbal lock, in which markers were seen."""
+    femur, tibia = motion()
+    found = joint_motion(Joint('knee', 'femur', 'tibia', 'cardan_xyz'), femur, tibia)
+    seen = np.full(len(found.status), JointStatus.GIMBAL, dtype=np.uint8)
+    seen[0] = JointStatus.AMBIGUOUS
+    panels = joint_figure(replace(found, status=seen)).axes
+    assert [len(panel.collections) for panel in panels] == 6 * [1]

@@ -54,9 +54,9 @@ KINDS = (slice(0, 3), slice(3, 6))  # components of a pose: position, rotation
 # 6 m/s, a golf swing rotates the forearm at 40 rad/s; impacts reach 100 g and 5000 rad/s^2.
 RADIAN_MM = 150.0  # shift of a body for a radian of its rotation
 START_SD = np.repeat([0.0, 6e3, 1e6], 6) * np.tile(np.repeat([1.0, 1 / RADIAN_MM], 3), 3)
-# Variance of a rotation of which nothing is known, uniform within half a turn [rad^2]: two exposures
-# do not show more turns. Velocity, acceleration and jerk of a body that appears may each move it as
-# far until the next exposure, at most.
+# Variance of a rotation of which nothing is known, uniform within half a turn [rad^2]: two
+# exposures do not show more turns. Velocity, acceleration and jerk of a body that appears may each
+# move it as far until the next exposure, at most.
 UNKNOWN_RAD2 = np.pi**2 / 3
 # Log of the density of jerk of a body that appears, [mm^2/s^5] and [rad^2/s^5], and its standard
 # deviation: from a body at rest (a jerk of 1 mm/s^3 for 1 s) to an impact (1e8 mm/s^3 for 1 ms).

@@ -12,9 +12,6 @@ access per point, plus the numpy calls for a small frame.
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,105 +30,8 @@ from .grid_cells import (
 EDGE = 1e-11
 
 
-class LookupWorkspace:
-    """Arrays, and views of them, for the lookup of up to n points in a table of cells.
-
-    Only one thread may use a workspace at a time. It is kept from frame to frame. All numpy calls
-    operate on whole, preallocated arrays of the same shape: the number of calls determines the
-    time of a frame of 30 points.
-
-    n: largest number of points. shape: numbers of rows and columns of cells on the image.
-    image_size: width and height of the image [px].
-    """
-
-    __slots__ = (
-        '_cell',
-        '_cells_per_px',
-        '_coefficients',
-        '_column',
-        '_columns_of_table',
-        '_constant',
-        '_found',
-        '_highest',
-        '_linear',
-        '_lowest',
-        '_of_one',
-        '_of_u',
-        '_shift',
-        '_slopes',
-        '_u',
-        '_v',
-        'place',
-        'result',
-        'row',
-        'status',
-        'uv',
-    )
-
-    def __init__(self, n: int, shape: tuple[int, int], image_size: tuple[int, int]) -> None:
-        rows, columns = shape
-        number = np.array([columns, rows])
-        cells_per_px = (number - 2 * EDGE) / np.array(image_size)
-        ones = np.ones((2, n))
-        self._cells_per_px = ones * cells_per_px[:, None]
-        self._shift = ones * (0.5 * cells_per_px + 1 + EDGE)[:, None]
-        self._lowest = ones * 0.5
-        self._highest = ones * (number[:, None] + 1.5)
-        self._columns_of_table = np.full(n, columns + 2)
-        pixels = np.zeros((9, n))  # u three times, v six times
-        self._u = pixels[:3]
-        self._v = pixels[3:]
-        self.uv = pixels[2:4]  #: (2, n) pixels
-        self.place = np.empty((2, n))  #: (2, n) pixels in units of cells
-        self._cell = np.empty((2, n), dtype=np.intp)
-        self._column = self._cell[0]
-        self.row = self._cell[1]  #: (n,) rows of their cells in the table
-        self._coefficients = np.empty((n, COEFFICIENTS))
-        self._found = np.empty((COEFFICIENTS, n))
-        self._constant = self._found[:6]
-        self._slopes = self._found[6:]
-        self._linear = np.empty((6, n))
-        self._of_one = self._linear[:3]
-        self._of_u = self._linear[3:]
-        self.result = np.empty((3, n))  #: (3, n) du, dv and standard deviation [px]
-        self.status = np.empty(n, dtype=np.uint8)  #: (n,) status of their cells
-
-    def locate(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> None:
-        """Find the cells of points u, v (m,) with m <= n; sets `uv`, `place` and `row`."""
-        place = self.place
-        row = self.row
-        count = len(u)
-        self._u[:, :count] = u
-        self._v[:, :count] = v
-        np.multiply(self.uv, self._cells_per_px, place)
-        np.add(place, self._shift, place)
-        np.fmax(place, self._lowest, place)  # also replaces NaN
-        np.fmin(place, self._highest, place)
-        self._cell[...] = place  # rounds down, as it is positive
-        np.multiply(row, self._columns_of_table, row)
-        np.add(row, self._column, row)
-
-    def interpolate(self, table: NDArray[np.float64], status: NDArray[np.uint8]) -> None:
-        """Evaluate the cells of the located points; sets `result` and `status`.
-
-        table (cells, COEFFICIENTS) and status (cells,) have a row for each cell.
-        """
-        linear = self._linear
-        result = self.result
-        # The rows are in range; modes other than 'clip' make an additional copy.
-        table.take(self.row, 0, self._coefficients, 'clip')
-        status.take(self.row, 0, self.status, 'clip')
-        self._found[...] = self._coefficients.T
-        np.multiply(self._slopes, self._v, linear)  # constant + slopes * v, of 1 and of u
-        np.add(linear, self._constant, linear)
-        np.multiply(self._of_u, self._u, result)
-        np.add(result, self._of_one, result)
-
-
 DIVIDED = 4  # added to the status of a cell that is divided
-CHUNK = 8192  # points per lookup, so that their workspace fits the cache
-# Capacities of workspaces: steps of 32 for frames, then powers of two.
-WORKSPACE_SIZES = (*range(0, 512, 32), 512, 1024, 2048, 4096, CHUNK)
+CHUNK = 8192  # points per lookup, so that their coefficients fit the cache
 
 
 class CorrectionGrid:
@@ -151,7 +51,6 @@ class CorrectionGrid:
         #: longer side of a cell
         self.cell_px = float(max(np.diff(axis).max() for axis in cells.nodes))
         self._set_tables(cells)
-        self._workspaces: list[list[LookupWorkspace]] = _no_workspaces()
         self.divided = 0  #: number of cells that are divided further
         errors = cells.errors
         if model.smoothness is not Smoothness.STEPPED:
@@ -170,7 +69,11 @@ class CorrectionGrid:
     def _set_tables(self, cells: Cells) -> None:
         """Make the tables of coefficients and status, one row for each cell."""
         rows, columns = cells.outside.shape
-        self._shape = (rows, columns)
+        number = np.array([[columns], [rows]])
+        self._cells_per_px = (number - 2 * EDGE) / np.array(self.image_size)[:, None]
+        self._shift = 0.5 * self._cells_per_px + 1 + EDGE
+        self._highest = number + 1.5
+        self._columns_of_table = columns + 2
         # A border of cells around the image covers points off the image, with NaN and INVALID.
         table = aligned_array((rows + 2, columns + 2, COEFFICIENTS))
         table[:] = np.nan
@@ -186,8 +89,7 @@ class CorrectionGrid:
         self._first = divided.first
         self._parts = divided.parts
         self._parts_table = divided.table
-        columns = self._shape[1] + 2
-        self._divided_cells = (divided.row + 1) * columns + divided.column + 1
+        self._divided_cells = (divided.row + 1) * self._columns_of_table + divided.column + 1
         self._status[self._divided_cells] += DIVIDED
         self.divided = len(divided.row)
 
@@ -205,10 +107,6 @@ class CorrectionGrid:
         error = np.abs(looked_up - exact).reshape(3, *u.shape).max(axis=1)
         return np.stack([error[:2].max(axis=0), error[2]])
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Copied views would no longer share memory, so workspaces are not pickled.
-        return {**self.__dict__, '_workspaces': _no_workspaces()}
-
     def look_up(
         self,
         u: NDArray[np.float64],
@@ -224,60 +122,67 @@ class CorrectionGrid:
         coordinates that are not a number.
         """
         n = len(u)
-        if n <= CHUNK:
-            return self._look_up(u, v, values, status)
         if values is None or status is None:
+            if n <= CHUNK:
+                return self._look_up(u, v)
             values = np.empty((3, n))
             status = np.empty(n, dtype=np.uint8)
         for start in range(0, n, CHUNK):
             part = slice(start, start + CHUNK)
-            self._look_up(u[part], v[part], values[:, part], status[part])
+            values[:, part], status[part] = self._look_up(u[part], v[part])
         return values, status
 
     def _look_up(
+        self, u: NDArray[np.float64], v: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """Look up at most CHUNK points; see `look_up`. Few numpy calls, most of them in place."""
+        place = np.array((u, v), dtype=float)  # in units of cells, in the table
+        place *= self._cells_per_px
+        place += self._shift
+        np.fmax(place, 0.5, place)  # also replaces NaN
+        np.fmin(place, self._highest, place)
+        column, row = place.astype(np.intp)  # rounds down, as it is positive
+        row *= self._columns_of_table
+        row += column
+        # The rows are in range; modes other than 'clip' make an additional copy.
+        status = self._status.take(row, mode='clip')
+        coefficients = np.empty((COEFFICIENTS, len(u)))
+        coefficients[...] = self._table.take(row, 0, mode='clip').T
+        values = _interpolated(coefficients, u, v)
+        if self.divided:
+            self._look_up_parts(u, v, place, row, (values, status))
+        return values, status
+
+    def _look_up_parts(
         self,
         u: NDArray[np.float64],
         v: NDArray[np.float64],
-        values: NDArray[np.float64] | None,
-        status: NDArray[np.uint8] | None,
-    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """Look up at most CHUNK points; see `look_up`."""
-        n = len(u)
-        number = bisect_left(WORKSPACE_SIZES, n)
-        workspaces = self._workspaces[number]
-        try:
-            workspace = workspaces.pop()  # exclusive to this thread until it is appended
-        except IndexError:
-            workspace = LookupWorkspace(WORKSPACE_SIZES[number], self._shape, self.image_size)
-        workspace.locate(u, v)
-        workspace.interpolate(self._table, self._status)
-        if self.divided:
-            self._look_up_parts(workspace)
-        if values is None or status is None:
-            values = workspace.result[:, :n].copy()
-            status = workspace.status[:n].copy()
-        else:
-            values[...] = workspace.result[:, :n]
-            status[...] = workspace.status[:n]
-        workspaces.append(workspace)
-        return values, status
-
-    def _look_up_parts(self, workspace: LookupWorkspace) -> None:
+        place: NDArray[np.float64],
+        row: NDArray[np.int64],
+        result: tuple[NDArray[np.float64], NDArray[np.uint8]],
+    ) -> None:
         """Replace the results of points in divided cells, whose status is DIVIDED or more."""
-        divided = np.flatnonzero(workspace.status >= DIVIDED)
+        values, status = result
+        divided = np.flatnonzero(status >= DIVIDED)
         if not len(divided):
             return
-        cell = np.searchsorted(self._divided_cells, workspace.row[divided])
+        cell = np.searchsorted(self._divided_cells, row[divided])
         parts = self._parts[cell]
-        place = workspace.place[:, divided]
-        column, row = np.minimum(((place - np.floor(place)) * parts).astype(np.intp), parts - 1)
-        columns = self._parts_table[self._first[cell] + row * parts + column].T
-        u, v = workspace.uv[:, divided]
-        half = columns[6:] * v + columns[:6]
-        workspace.result[:, divided] = half[3:] * u + half[:3]
-        workspace.status[divided] -= DIVIDED
+        place = place[:, divided]
+        column, line = np.minimum(((place - np.floor(place)) * parts).astype(np.intp), parts - 1)
+        coefficients = self._parts_table[self._first[cell] + line * parts + column].T
+        values[:, divided] = _interpolated(coefficients, u[divided], v[divided])
+        status[divided] -= DIVIDED
 
 
-def _no_workspaces() -> list[list[LookupWorkspace]]:
-    """Return empty lists of free workspaces, by WORKSPACE_SIZES."""
-    return [[] for _ in WORKSPACE_SIZES]
+def _interpolated(
+    coefficients: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return values (3, n) from coefficients (12, n) of 1, u, v, u v; overwrites these."""
+    of_v = coefficients[6:]
+    of_v *= v
+    of_v += coefficients[:6]
+    values = of_v[3:]
+    values *= u
+    values += of_v[:3]
+    return values

@@ -206,7 +206,7 @@ def test_live_and_recorded_with_the_same_lag_are_the_same_bytes():
     ],
 )
 def test_poses_far_apart_in_time_are_as_good_as_each_alone(times_s, rad):
-    """Low rates, a long gap, and a single exposure; rad: rotation from one exposure to the next."""
+    """Low rates, a long gap, and a single exposure; rad: rotation between two exposures."""
     rng = np.random.default_rng(3)
     rig = orientation()
     bone = body(rng, 4, 'femur', 1)

@@ -131,7 +131,7 @@ class _Step:
 class Motion:
     """Smoothed motion of B bodies in T exposures.
 
-    Values are NaN before a body appears. Covariances are those of the random errors.
+    Values before a body appears mean nothing. Covariances are those of the random errors.
 
     Attributes
     ----------
@@ -404,21 +404,16 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
     count = len(steps[0].z)
     total = len(steps)
     motion = Motion(
-        np.full((total, count, 3, 3), np.nan),
-        np.full((total, count, 3), np.nan),
-        velocity=np.full((total, count, 6), np.nan),
-        acceleration=np.full((total, count, 6), np.nan),
-        covariance=np.full((total, count, STATE, STATE), np.nan),
+        np.empty((total, count, 3, 3)),
+        np.empty((total, count, 3)),
+        velocity=np.empty((total, count, 6)),
+        acceleration=np.empty((total, count, 6)),
+        covariance=np.empty((total, count, STATE, STATE)),
         log_q=np.stack([step.log_q for step in steps]),
     )
     scores = _Scores(np.zeros((total, count, 2)), np.zeros((total, count, 2)))
     r = np.zeros((count, STATE))
     n = np.zeros((count, STATE, STATE))
-    seen = np.zeros((total, count), dtype=bool)
-    alive = np.zeros(count, dtype=bool)
-    for k, step in enumerate(steps):
-        alive = alive | step.started | (step.covariance[:, 0, 0] > 0)
-        seen[k] = alive
     for k in range(total - 1, -1, -1):
         step = steps[k]
         # r and n already contain L'F'r and L'F'N F L of the next step.
@@ -446,9 +441,6 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         forward = np.swapaxes(step.into, 1, 2)
         r = (forward @ r[:, :, None])[:, :, 0]
         n = forward @ n @ step.into
-    for array in (motion.rotation, motion.centre_mm, motion.velocity, motion.acceleration):
-        array[~seen] = np.nan
-    motion.covariance[~seen] = np.nan
     return motion, scores
 
 

@@ -503,20 +503,27 @@ def _motion(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
 def _unchanged(body: Body, findings: Sequence[Finding]) -> EstimatedShape:
     known = body.xyz_mm[body.known]
     condition = condition_number(known) if len(known) >= 2 else np.inf
-    return EstimatedShape(
-        body,
-        condition,
-        mean_error_mm=np.nan,
-        exposures=0,
-        findings=tuple(findings),
+    return EstimatedShape(body, condition, np.nan, exposures=0, findings=tuple(findings))
+
+
+def _warning(
+    body: Body,
+    kind: Kind,
+    cause: str,
+    numbers: Mapping[str, float],
+    markers: Sequence[int] = (),
+) -> Finding:
+    """Return a warning about a body, or some of its markers."""
+    return replace(
+        _error(body, kind, cause, numbers),
+        place=_place(body, markers),
+        severity=Severity.WARNING,
     )
 
 
-def _warning(body: Body, kind: Kind, cause: str, numbers: Mapping[str, float]) -> Finding:
-    """Return a warning about a body."""
-    return Finding(
-        kind, cause, place=_place(body), severity=Severity.WARNING, numbers=dict(numbers)
-    )
+def _error(body: Body, kind: Kind, cause: str, numbers: Mapping[str, float]) -> Finding:
+    """Return a finding on coordinates that are wrong as a whole."""
+    return Finding(kind, cause, place=_place(body), numbers=dict(numbers))
 
 
 def _place(body: Body, markers: Sequence[int] = ()) -> Place:
@@ -524,13 +531,8 @@ def _place(body: Body, markers: Sequence[int] = ()) -> Place:
 
 
 def _unseen(body: Body) -> Finding:
-    return Finding(
-        Kind.BODY_UNSEEN,
-        'no exposure has three of its markers in space: its shape is not estimated',
-        place=_place(body),
-        severity=Severity.WARNING,
-        numbers={'markers': float(len(body.target_id))},
-    )
+    cause = 'no exposure has three of its markers in space: its shape is not estimated'
+    return _warning(body, Kind.BODY_UNSEEN, cause, {'markers': float(len(body.target_id))})
 
 
 def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
@@ -550,8 +552,7 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
             f'its coordinates are in {unit}, not in mm: distances in space are {factor:.4g} '
             'times larger'
         )
-        numbers = {'factor': factor}
-        return [Finding(Kind.WRONG_UNIT, cause, place=_place(body), numbers=numbers)]
+        return [_error(body, Kind.WRONG_UNIT, cause, {'factor': factor})]
     if count[row] < 4:
         return []
     errors = []
@@ -567,7 +568,7 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
             f'{errors[0]:.2g} mm, and from their mirror image by {errors[1]:.2g} mm'
         )
         numbers = {'rms_mm': errors[0], 'rms_mirrored_mm': errors[1]}
-        return [Finding(Kind.BODY_MIRRORED, cause, place=_place(body), numbers=numbers)]
+        return [_error(body, Kind.BODY_MIRRORED, cause, numbers)]
     return []
 
 
@@ -591,29 +592,16 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
             f'it is not rigid: the positions of its markers scatter by {ratio:.1f} times their '
             'standard deviations'
         )
-        findings.append(
-            _warning(
-                body,
-                Kind.BODY_NOT_RIGID,
-                cause,
-                {'ratio': ratio, 'mean_error_mm': adjustment.mean_error_mm},
-            )
-        )
+        numbers = {'ratio': ratio, 'mean_error_mm': adjustment.mean_error_mm}
+        findings.append(_warning(body, Kind.BODY_NOT_RIGID, cause, numbers))
     for row in moving:
         marker = int(body.target_id[row])
+        ratio = float(np.sqrt(test[row]))
         cause = (
             f'marker {marker} moves relative to the others: its positions scatter by '
-            f'{np.sqrt(test[row]):.1f} times their standard deviations'
+            f'{ratio:.1f} times their standard deviations'
         )
-        findings.append(
-            Finding(
-                Kind.MARKER_LOOSE,
-                cause,
-                place=_place(body, [marker]),
-                severity=Severity.WARNING,
-                numbers={'ratio': float(np.sqrt(test[row]))},
-            )
-        )
+        findings.append(_warning(body, Kind.MARKER_LOOSE, cause, {'ratio': ratio}, [marker]))
     return findings
 
 
@@ -640,7 +628,7 @@ def _wrong_as_a_whole(
             f'distances between its markers in space are {factor:.4f} times those of its '
             'coordinates: check the voxel size of the CT, and the scale of the phantom'
         )
-        return [Finding(Kind.BODY_SCALED, cause, place=_place(body), numbers={'factor': factor})]
+        return [_error(body, Kind.BODY_SCALED, cause, {'factor': factor})]
     pair = _exchanged(given, estimated, sd)
     if pair is None:
         return []
@@ -677,15 +665,8 @@ def _migrated(
             f'marker {marker} is {distance:.2g} mm from where CT has it, with a standard '
             f'deviation of {sd[k]:.2g} mm: it has migrated, or is another one'
         )
-        findings.append(
-            Finding(
-                Kind.MARKER_MIGRATED,
-                cause,
-                place=_place(body, [marker]),
-                severity=Severity.WARNING,
-                numbers={'distance_mm': distance, 'sd_mm': float(sd[k])},
-            )
-        )
+        numbers = {'distance_mm': distance, 'sd_mm': float(sd[k])}
+        findings.append(_warning(body, Kind.MARKER_MIGRATED, cause, numbers, [marker]))
     return findings
 
 
@@ -770,9 +751,8 @@ def _stability(body: Body, condition: float, mean_error_mm: float) -> list[Findi
             f'it is not rigid: its markers deviate from its shape by {mean_error_mm:.2g} mm '
             f'(RMS; at most {MAX_MEAN_ERROR_MM} mm by ISO 16087)'
         )
-        findings.append(
-            _warning(body, Kind.BODY_NOT_RIGID, cause, {'mean_error_mm': mean_error_mm})
-        )
+        numbers = {'mean_error_mm': mean_error_mm}
+        findings.append(_warning(body, Kind.BODY_NOT_RIGID, cause, numbers))
     return findings
 
 

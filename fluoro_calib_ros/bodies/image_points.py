@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.cameras import Cameras
 from ..reconstruction.intersection import OK, OUTSIDE
 from ..reconstruction.reconstruct import IntersectedViews
 from .body import by_pose
@@ -37,7 +38,7 @@ class Linear:
     valid: NDArray[np.bool_]  # (B, M, F), whether seen, and the marker in front of the source
 
 
-class Cameras:
+class BodyCameras:
     """Fluoroscopes of a rig and their views of the markers of bodies.
 
     target_id: (B, M) markers of B bodies; -1 pads bodies with fewer markers.
@@ -45,18 +46,8 @@ class Cameras:
 
     def __init__(self, orientation: RigOrientation, target_id: NDArray[np.int64]) -> None:
         self.target_id = target_id
-        self._views = len(orientation.fluoroscopes)
-        self._interior = orientation.interior
-        camera = np.zeros((self._views, 3, 3))
-        camera[:, 0, 0] = camera[:, 1, 1] = orientation.interior[:, 2]
-        camera[:, :, 2] = np.column_stack([orientation.interior[:, :2], np.ones(self._views)])
-        rows = camera @ orientation.rotation
-        self._matrix = rows.reshape(-1, 3).T.copy()
-        self._shift = -(rows @ orientation.position_mm[:, :, None]).reshape(-1)
-        self._uv_rows = rows[:, :2]
-        self._depth_rows = rows[:, 2:]
-        # (F, 9, k): root of the orientation covariance, by independent unknowns of unit variance.
-        self.root = orientation.covariance_root().reshape(self._views, ORIENTATION_SIZE, -1)
+        self._cameras = Cameras(orientation)
+        self.root = self._cameras.root
         self._ids: NDArray[np.integer] | None = None
         self._rows = np.zeros(0, dtype=int)
 
@@ -71,9 +62,9 @@ class Cameras:
             known = (ids[rows] == self.target_id.ravel()) if len(ids) else rows >= 0
             self._rows = np.where(known, rows, len(ids))
             self._ids = ids
-        shape = (*self.target_id.shape, self._views)
+        shape = (*self.target_id.shape, self._cameras.count)
         # One additional row for markers that are not present.
-        padded = np.full((self._views, len(ids) + 1, 4), np.nan)
+        padded = np.full((self._cameras.count, len(ids) + 1, 4), np.nan)
         padded[:, :-1, :2] = views.uv
         padded[:, :-1, 2] = views.sigma
         padded[:, :-1, 3] = views.correction_sd
@@ -109,32 +100,16 @@ class Cameras:
         centres (B, 3).
         """
         rotation, centre = pose
-        shape = points.seen.shape
         arm = xyz @ np.swapaxes(rotation, 1, 2)
-        image = ((arm + centre[:, None]) @ self._matrix + self._shift).reshape(*shape, 3)
+        image = self._cameras.image(arm + centre[:, None])
         depth = np.where(image[..., 2] > 0, image[..., 2], np.nan)
         uv = np.where(depth[..., None] > 0, image[..., :2] / depth[..., None], 0.0)
-        by_place = (self._uv_rows - uv[..., None] * self._depth_rows) / depth[..., None, None]
+        by_place = self._cameras.by_place(uv, depth)
         valid = points.seen & np.isfinite(depth)
         residual = np.where(valid[..., None], points.uv - uv, 0.0)
         by_place = np.where(valid[..., None, None], by_place, 0.0)
         return Linear(residual, by_place, uv, by_pose(arm), valid)
 
     def by_orientation(self, linear: Linear) -> NDArray[np.float64]:
-        """Return derivatives (B, M, F, 2, 9) by T, w, xp, yp, c; see collinearity."""
-        interior = self._interior
-        c = interior[:, 2]
-        xy = (linear.uv - interior[:, :2]) / c[:, None]
-        x, y = xy[..., 0], xy[..., 1]
-        out = np.zeros((*x.shape, 2, ORIENTATION_SIZE))
-        out[..., :3] = -linear.by_place
-        out[..., 0, 3] = out[..., 1, 4] = c * x * y
-        out[..., 0, 3] *= -1
-        out[..., 0, 4] = c * (1 + x * x)
-        out[..., 0, 5] = -c * y
-        out[..., 1, 3] = -c * (1 + y * y)
-        out[..., 1, 5] = c * x
-        out[..., 0, 6] = out[..., 1, 7] = 1
-        out[..., 0, 8] = x
-        out[..., 1, 8] = y
-        return out
+        """Return derivatives (B, M, F, 2, 9) by T, w, xp, yp, c."""
+        return self._cameras.by_orientation(linear.uv, linear.by_place)

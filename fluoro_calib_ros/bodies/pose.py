@@ -39,7 +39,7 @@ from ..photogrammetry.rotations import cross_matrix, vector_from_matrix
 from ..photogrammetry.unknowns import POSE_SIZE, SINGULAR
 from ..reconstruction.reconstruct import IntersectedViews
 from .body import Body, robust_pose
-from .image_points import Cameras, ImagePoints, Linear
+from .image_points import BodyCameras, ImagePoints, Linear
 from .motion import EYE_3, EYE_6, PoseInformation, turn_of_twists, twist_between
 
 MAX_STEPS = 8  # maximum number of Gauss-Newton steps
@@ -154,7 +154,7 @@ class PoseSolver:
             self.xyz[row, :count] = body.xyz_mm - self.centre[row]
             self.variance[row, :count] = body.sd_mm**2
         self._variance_3 = self.variance[..., None, None]
-        self.cameras = Cameras(orientation, self.target_id)
+        self.cameras = BodyCameras(orientation, self.target_id)
         # Fraction of each element of a step that remains as the next step.
         source = orientation.position_mm
         radius = np.linalg.norm(source - source.mean(axis=0), axis=1).max()
@@ -541,7 +541,7 @@ def _covariances(
     inverse: NDArray[np.float64],
     solution: _Solution,
     observed: tuple[ImagePoints, NDArray[np.float64]],
-    cameras: Cameras,
+    cameras: BodyCameras,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return covariances (B, 6, 6) of poses from noise and constant errors, and the rig's root.
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri, erfc
 
 from ..bodies.body import Body, check_bodies, fitted_pose
-from ..bodies.image_points import Cameras, ImagePoints, Linear
+from ..bodies.image_points import BodyCameras, ImagePoints, Linear
 from ..bodies.pose import marker_sums
 from ..bodies.shapes import REGULAR, learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -125,7 +125,7 @@ class BodyWatch:
             self._known[row, columns] = known
             self._xyz[row, columns] = np.where(known[:, None], body.xyz_mm, 0.0)
             self._variance[row, columns] = np.where(known, body.sd_mm, 0.0) ** 2
-        self._cameras = Cameras(self._orientation, target_id)
+        self._cameras = BodyCameras(self._orientation, target_id)
 
     def add(self, exposure: IntersectedViews) -> None:
         """Add an exposure of the fluoroscopes of the orientation."""

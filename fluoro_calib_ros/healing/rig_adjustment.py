@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from ..bodies.body import Body
 from ..bodies.correction_errors import covariance_of_means
-from ..bodies.image_points import Cameras, ImagePoints
+from ..bodies.image_points import BodyCameras, ImagePoints
 from ..correction.series import MARGIN, Functions
 from ..correction.terms import CUBIC
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
@@ -575,7 +575,7 @@ class LinearPoints:
     ) -> LinearPoints:
         """Linearise at values of the unknowns and at poses."""
         grid = observed.seen.shape  # (T, B, M, F)
-        cameras = Cameras(adjustment.rig_at(values), adjustment.target_id)
+        cameras = BodyCameras(adjustment.rig_at(values), adjustment.target_id)
         shape = adjustment.shapes_at(values)
         valid = observed.seen & poses.known[:, :, None, None]
         bias = values[adjustment.bias].reshape(*grid[1:], 2)

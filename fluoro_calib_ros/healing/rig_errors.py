@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.image_points import Cameras, ImagePoints
+from ..bodies.image_points import BodyCameras, ImagePoints
 from ..photogrammetry.network import DATUM_DEFECT, similarity_directions
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.unknowns import POSE_SIZE
@@ -73,7 +73,7 @@ class _Intersected:
 
     @classmethod
     def of(cls, orientation: RigOrientation, points_mm: NDArray[np.float64]) -> _Intersected:
-        cameras = Cameras(orientation, np.zeros((1, len(points_mm)), dtype=int))
+        cameras = BodyCameras(orientation, np.zeros((1, len(points_mm)), dtype=int))
         views = len(orientation.fluoroscopes)
         shape = (1, len(points_mm), views)
         empty = ImagePoints(

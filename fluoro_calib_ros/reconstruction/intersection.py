@@ -27,7 +27,8 @@ from scipy.special import chdtri, erfc
 
 from ..errors import DataError
 from ..photogrammetry.noise import ObservedScatter
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
+from ..photogrammetry.rig_orientation import RigOrientation
+from .cameras import Cameras
 
 
 class PointStatus(IntEnum):
@@ -55,9 +56,6 @@ MAX_LAST_STEP = 1e-2
 # Minimum determinant of a normal matrix over the cube of its mean diagonal: rays that meet at less
 # than 1e-4 rad count as parallel.
 MIN_DETERMINANT = 1e-8
-# The derivatives of an image point by T, w, xp, yp, c are combinations of this many functions of
-# x, y and 1/Z.
-_FUNCTIONS = 9
 _COFACTORS = np.array(
     [
         [4, 5, 3, 7, 8, 6, 1, 2, 0],
@@ -132,26 +130,12 @@ class Intersector:
             raise ValueError(f'reject must be above 0, not {reject}')
         self.orientation = orientation
         self.reject = reject
-        interior = orientation.interior
         count = len(orientation.fluoroscopes)
-        camera = np.zeros((count, 3, 3))
-        camera[:, 0, 0] = interior[:, 2]
-        camera[:, 1, 1] = interior[:, 2]
-        camera[:, :, 2] = np.column_stack([interior[:, :2], np.ones(count)])
-        rows = camera @ orientation.rotation
-        shift = -(rows @ orientation.position_mm[:, :, None])[:, :, 0]
         self._count = count
-        self._matrix = rows.reshape(-1, 3).T.copy()
-        self._shift = shift.reshape(-1)
-        self._uv_rows = rows[:, :2]
-        self._depth_rows = rows[:, 2:]
-        self._point = interior[:, :2]
-        self._distance = interior[:, 2:]
+        self._cameras = Cameras(orientation)
         depth = _depth_of_axes(orientation)
-        self._start_rows = rows / depth[:, None, None], shift / depth[:, None]
-        self._by_orientation = _by_independent_unknowns(
-            _derivative_functions(orientation), orientation.covariance_root()
-        )
+        self._start_rows = self._cameras.rows / depth[:, None, None]
+        self._start_shift = self._cameras.shift / depth[:, None]
         self._limit = largest_lack_of_fit(np.inf if reject is None else float(reject), count)
         self._median = _medians(count)
 
@@ -236,13 +220,11 @@ class Intersector:
         flat = np.repeat(weight, 2, axis=1)[:, :, None]
         xyz = self._start(uv, flat)
         for _ in range(MAX_STEPS):
-            image = (xyz @ self._matrix + self._shift).reshape(n, count, 3)
+            image = self._cameras.image(xyz)
             depth = image[:, :, 2]
             predicted = image[:, :, :2] / depth[:, :, None]
-            a = (
-                (self._uv_rows - predicted[:, :, :, None] * self._depth_rows)
-                / depth[:, :, None, None]
-            ).reshape(n, 2 * count, 3)
+            by_place = self._cameras.by_place(predicted, depth)
+            a = by_place.reshape(n, 2 * count, 3)
             weighted = (a * flat).transpose(0, 2, 1)
             r = (uv - predicted).reshape(n, 2 * count, 1)
             right = weighted @ r
@@ -254,7 +236,8 @@ class Intersector:
                 break
         r = r - a @ step
         squares = flat[:, :, 0] * (r * r)[:, :, 0]
-        by_rig = self._image_jacobian(predicted, depth)
+        by_rig = self._cameras.by_orientation(predicted, by_place) @ self._cameras.root
+        by_rig = by_rig.reshape(n, 2 * count, by_rig.shape[-1])
         by_point = (inverse @ weighted) @ by_rig
         by_residual = by_rig - a @ by_point
         freedom = 2 * rays - 3
@@ -278,35 +261,11 @@ class Intersector:
         likewise for v, with the projection matrices scaled so that a point where the axes meet has
         depth one.
         """
-        rows, shift = self._start_rows
+        rows, shift = self._start_rows, self._start_shift
         a = (rows[:, :2] - uv[:, :, :, None] * rows[:, 2:]).reshape(-1, 2 * self._count, 3)
         b = (uv * shift[:, 2:] - shift[:, :2]).reshape(-1, 2 * self._count, 1)
         weighted = (a * flat).transpose(0, 2, 1)
         return (_inverse(weighted @ a)[0] @ (weighted @ b))[:, :, 0]
-
-    def _image_jacobian(
-        self, predicted: NDArray[np.float64], depth: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return derivatives (n, 2F, 9F) of the image points by the orientation.
-
-        The orientation is expressed by independent unknowns of unit variance. predicted (n, F, 2)
-        [px], depth (n, F) [mm].
-        """
-        n, count = depth.shape
-        functions = np.empty((count, n, _FUNCTIONS))
-        xy = ((predicted - self._point) / self._distance).transpose(1, 0, 2)
-        inverse_depth = 1 / depth.T
-        functions[:, :, 0] = 1
-        functions[:, :, 1:3] = xy
-        functions[:, :, 3:5] = xy * xy
-        functions[:, :, 5] = xy[:, :, 0] * xy[:, :, 1]
-        functions[:, :, 6] = inverse_depth
-        functions[:, :, 7:9] = xy * inverse_depth[:, :, None]
-        return (
-            (functions @ self._by_orientation)
-            .transpose(1, 0, 2)
-            .reshape(n, 2 * count, ORIENTATION_SIZE * count)
-        )
 
     def _classified(
         self,
@@ -457,45 +416,3 @@ def _depth_of_axes(orientation: RigOrientation) -> NDArray[np.float64]:
     point = np.linalg.lstsq(projector.sum(axis=0), right)[0]
     depth = np.sum(axis * (point - orientation.position_mm), axis=1)
     return np.where(depth > 0, depth, 1.0)
-
-
-def _derivative_functions(orientation: RigOrientation) -> NDArray[np.float64]:
-    """Return coefficients (F, 9, 2, 9) of nine functions in derivatives by T, w, xp, yp, c.
-
-    The derivatives of u and v are those of the collinearity equations, expanded. The functions are
-    1, x, y, x^2, y^2, xy, 1/Z, x/Z and y/Z with x = X/Z and y = Y/Z.
-    """
-    out = np.zeros((len(orientation.fluoroscopes), _FUNCTIONS, 2, ORIENTATION_SIZE))
-    for k, r, c in zip(out, orientation.rotation, orientation.interior[:, 2]):
-        k[6, 0, :3] = -c * r[0]
-        k[6, 1, :3] = -c * r[1]
-        k[7, 0, :3] = c * r[2]
-        k[8, 1, :3] = c * r[2]
-        k[5, 0, 3] = -c
-        k[0, 0, 4] = c
-        k[3, 0, 4] = c
-        k[2, 0, 5] = -c
-        k[0, 1, 3] = -c
-        k[4, 1, 3] = -c
-        k[5, 1, 4] = c
-        k[1, 1, 5] = c
-        k[0, 0, 6] = 1
-        k[0, 1, 7] = 1
-        k[1, 0, 8] = 1
-        k[2, 1, 8] = 1
-    return out
-
-
-def _by_independent_unknowns(
-    functions: NDArray[np.float64], root: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return coefficients (F, 9, 18F) of derivatives by independent unknowns of unit variance.
-
-    functions (F, 9, 2, 9): coefficients by the unknowns of the orientation. root (9F, 9F): root of
-    their covariance.
-    """
-    count = len(functions)
-    out = functions.reshape(count, 2 * _FUNCTIONS, ORIENTATION_SIZE) @ root.reshape(
-        count, ORIENTATION_SIZE, -1
-    )
-    return out.reshape(count, _FUNCTIONS, -1)

@@ -137,8 +137,12 @@ def _residuals(
 ) -> _Residuals:
     """Return the epipolar residuals of all pairs of views within the calibrated areas."""
     names = orientation.fluoroscopes
-    frames = [exposure.get(name) for name in names]
-    views = match_views([f and corrected_view(f, calibrations[f.fluoroscope]) for f in frames])
+    views = match_views(
+        [
+            corrected_view(exposure[name], calibrations[name]) if name in exposure else None
+            for name in names
+        ]
+    )
     noise = np.sqrt(np.maximum(views.sigma**2 - views.correction_sd**2, 0.0))
     widths = [calibrations[name].image_size[0] for name in names]
     parts = []

@@ -19,10 +19,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import map_coordinates
 
 from .calibration_record import HARMONICS, ORDERS, SD_GRID, VARIANCES
-from .series import Functions, Series, sd_grid_pixels
+from .series import Functions, Series, at_sd_grid, sd_grid_pixels
 from .terms import CUBIC
 
 PAIRS = [(j, k) for j in range(HARMONICS) for k in range(j, HARMONICS)]
@@ -40,8 +39,7 @@ def harmonics(angle: ArrayLike) -> NDArray[np.float64]:
 class _Change:
     """Change of a correction at an angle."""
 
-    #: (4, k, 2, 4) coefficients of x^i y^j, indexed by i, field, u or v, j: first the change, then
-    #: the fields of its uncertainty
+    #: (k, 2, 10) of the functions, for u and v: first the change, then fields of its uncertainty
     coefficients: NDArray[np.float64]
     variance: NDArray[np.float64]  #: (33, 33) on the grid of the standard deviation [px^2]
     scatters: bool  #: whether there are fields of uncertainty
@@ -161,7 +159,7 @@ class AngleField:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         change = self._unknown if np.isnan(angle) else self._known(angle)
         values = self._values(uv, change.coefficients)
-        variance = self._at(uv, change.variance)
+        variance = at_sd_grid(change.variance, uv, self.image_size)
         if change.scatters:
             variance = variance + np.einsum('nka,nka->n', values[:, 1:], values[:, 1:]) / 2
         return values[:, 0], variance
@@ -194,30 +192,15 @@ class AngleField:
         j, k = np.transpose(PAIRS)
         factors = np.concatenate([2 * weights, products[j, k] * np.where(j == k, 1, 2)])
         coefficients = np.tensordot(fields, self.coefficients, axes=1)
-        square = np.zeros((CUBIC + 1, *coefficients.shape[:2], CUBIC + 1))
-        for term, (x, y) in enumerate(self._functions.powers):
-            square[x, :, :, y] = coefficients[:, :, term]
         variance = np.tensordot(factors, self.variances, axes=1)
-        return _Change(square, variance, len(fields) > 1)
+        return _Change(coefficients, variance, len(fields) > 1)
 
     def _values(
         self, uv: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return values (n, k, 2) of k fields from the coefficients of a `_Change`."""
-        side = max(self.image_size) / 2
-        powers = np.empty((CUBIC + 1, len(uv), 2))
-        powers[0] = 1
-        powers[1] = (uv - (np.asarray(self.image_size) - 1) / 2) / side
-        for order in range(2, CUBIC + 1):
-            np.multiply(powers[order - 1], powers[1], out=powers[order])
-        by_y = powers[:, :, 0].T @ coefficients.reshape(CUBIC + 1, -1)
-        by_y = by_y.reshape(len(uv), *coefficients.shape[1:])
-        return np.einsum('nkay,yn->nka', by_y, powers[:, :, 1])
-
-    def _at(self, uv: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Interpolate a grid (33, 33) over the image at pixels uv (n, 2); returns (n,)."""
-        place = (uv + 0.5) / np.asarray(self.image_size) * (SD_GRID - 1)
-        return map_coordinates(grid, place[:, ::-1].T, order=1, mode='nearest')
+        """Return values (n, k, 2) of k fields from their coefficients (k, 2, 10)."""
+        flat = coefficients.reshape(-1, coefficients.shape[-1])
+        return (self._functions(uv) @ flat.T).reshape(len(uv), *coefficients.shape[:2])
 
 
 def packed_angles(

@@ -24,7 +24,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from ..limits import MAX_CORNERS
 from .calibration_record import SD_GRID
-from .series import Series, packed
+from .series import SERIES_FIELDS, Series, packed
 
 
 class CorrectionStatus(IntEnum):
@@ -177,7 +177,6 @@ class CorrectionModel(ABC):
 
         `registry.model_from_values` creates an equal model from them.
         """
-        degree, modes, coefficients, sd = packed(self.series)
         return {
             'model_kind': self.kind,
             'model_k': self.k,
@@ -185,10 +184,7 @@ class CorrectionModel(ABC):
             'train_duv': self.train_duv,
             'noise_px': self.noise_px,
             'bias_px': self.bias_px,
-            'series_degree': degree,
-            'series_modes': modes,
-            'series_coefficients': coefficients,
-            'series_sd': sd,
+            **dict(zip(SERIES_FIELDS, packed(self.series))),
         }
 
 
@@ -212,10 +208,10 @@ def _holes_of(uv: NDArray[np.float64], hull: NDArray[np.float64]) -> Holes | Non
     "On the shape of a set of points in the plane", IEEE Transactions on Information Theory 29,
     1983). The radius of a hole is at least the spacing of the nodes of the standard deviation.
     """
-    try:
-        area = ConvexHull(uv).volume  # in the plane, `volume` is the area
-    except (QhullError, ValueError):
+    outline = convex_hull(uv)
+    if outline is None:
         return None
+    area = outline.volume  # in the plane, `volume` is the area
     low, high = uv.min(axis=0), uv.max(axis=0)
     radius = max(
         HOLE_SPACINGS * float(np.sqrt(area / len(uv))), float(np.max(high - low)) / (SD_GRID - 1)
@@ -238,7 +234,14 @@ def _half_planes(uv: NDArray[np.float64]) -> NDArray[np.float64]:
 
     A pixel (u, v) is inside where a u + b v + c <= 0 for every row (a, b, c).
     """
+    outline = convex_hull(uv)
+    # Without an area, everything is outside.
+    return np.array([[0.0, 0.0, 1.0]]) if outline is None else outline.equations
+
+
+def convex_hull(uv: NDArray[np.float64]) -> ConvexHull | None:
+    """Return the convex hull of points uv (N, 2), None if they span no area."""
     try:
-        return ConvexHull(uv).equations
+        return ConvexHull(uv)
     except (QhullError, ValueError):
-        return np.array([[0.0, 0.0, 1.0]])  # no area: everything is outside
+        return None

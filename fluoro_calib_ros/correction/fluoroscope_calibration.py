@@ -29,7 +29,7 @@ from .base import Correction, CorrectionModel, CorrectionStatus
 from .calibration_record import FIELDS, Field
 from .grid import CorrectionGrid
 from .registry import MODEL_FIELDS, model_from_values
-from .series import Functions, Series
+from .series import SERIES_FIELDS, Functions, Series
 
 MAX_FACTOR = 10.0  # maximum estimated ratio of the factors of border and middle, or of its inverse
 
@@ -94,7 +94,6 @@ def square_distance(
 
 
 _ANGLES = ('angles', 'angle_coefficients', 'angle_variances')
-_SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
 
 
 @dataclass(frozen=True)
@@ -186,7 +185,7 @@ class FluoroscopeCalibration:
         words = []
         for entry in fields:
             value = values[entry.name]
-            if entry.name in _SERIES and self.model.series is None:
+            if entry.name in SERIES_FIELDS and self.model.series is None:
                 continue
             if entry.dtype == 'text':
                 words.append(value)

@@ -10,10 +10,12 @@ from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
+from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from .base import BULK_CHUNK, Correction, CorrectionModel, Smoothness
+from .terms import polynomial_powers
 
 # Nearest training points of very many pixels, block by block.
 #
@@ -240,15 +242,11 @@ class NeighbourTable:
 class Trend:
     """Polynomials in two variables, centred and scaled by the training pixels.
 
-    degree: highest degree, or None for no polynomials. uv (N, 2): training pixels.
+    degree: highest degree; -1: no polynomials. uv (N, 2): training pixels.
     """
 
-    def __init__(self, degree: int | None, uv: NDArray[np.float64]) -> None:
-        self._powers = (
-            []
-            if degree is None
-            else [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
-        )
+    def __init__(self, degree: int, uv: NDArray[np.float64]) -> None:
+        self._powers = polynomial_powers(degree)
         self._centre = uv.mean(axis=0) if len(uv) else np.zeros(2)
         self._scale = max(float(np.max(np.abs(uv - self._centre), initial=0.0)), 1.0)
 
@@ -258,16 +256,11 @@ class Trend:
     def basis(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Return values (n, p) of the polynomials at pixels uv (n, 2)."""
         x, y = ((np.asarray(uv) - self._centre) / self._scale).T
-        out = np.empty((len(x), len(self._powers)))
-        for column, (i, j) in enumerate(self._powers):
-            # Each polynomial is a previous one times x or y.
-            if i:
-                np.multiply(out[:, self._powers.index((i - 1, j))], x, out=out[:, column])
-            elif j:
-                np.multiply(out[:, self._powers.index((i, j - 1))], y, out=out[:, column])
-            else:
-                out[:, column] = 1.0
-        return out
+        if not self._powers:
+            return np.empty((len(x), 0))
+        degree = max(i for i, _ in self._powers)
+        i, j = np.transpose(self._powers)
+        return polyvander2d(x, y, [degree, degree])[:, i * (degree + 1) + j]
 
 
 def least_squares_map(basis: np.ndarray) -> NDArray[np.float64]:
@@ -290,7 +283,7 @@ class NeighbourModel(CorrectionModel):
 
     smoothness = Smoothness.KINKED
     min_k: ClassVar[int]
-    trend_degree: ClassVar[int | None] = None  # degree of the polynomial trend, or None
+    trend_degree: ClassVar[int] = -1  # degree of the polynomial trend; -1: none
     equal_weights: ClassVar[bool] = False  # all weights are 1/k; running means yield all k
     gauge_passes: ClassVar[int] = 3  # a smoother reproduces the gauge only approximately
 
@@ -437,7 +430,7 @@ class LocalLinearModel(NeighbourModel):
     kind = 'local_linear'
     description = 'cubic trend, and planes fitted to the k nearest residuals'
     min_k = 6
-    trend_degree: ClassVar[int | None] = 3
+    trend_degree = 3
     gauge_passes = 1  # the trend reproduces the gauge
 
     @classmethod
@@ -472,7 +465,7 @@ class HybridModel(LocalLinearModel):
     kind = 'hybrid'
     description = 'cubic trend in the adjustment, and planes fitted to the k nearest residuals'
     has_series = True
-    trend_degree = None
+    trend_degree = -1
     gauge_passes = 3
 
 

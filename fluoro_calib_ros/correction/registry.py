@@ -20,12 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
-from scipy.spatial import ConvexHull, QhullError
 
-from .base import CorrectionModel
+from .base import CorrectionModel, convex_hull
 from .grid_cells import CELL_PX
 from .neighbours import HybridModel, KnnModel, LocalLinearModel
-from .series import Series, series_from_values
+from .series import SERIES_FIELDS, Series, unpacked
 
 # The model `none`: it corrects nothing.
 
@@ -137,10 +136,8 @@ def grid_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
 
 def hull_corners(uv: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the convex hull corners (h, 2) of uv (N, 2); all points if they span no area."""
-    try:
-        return uv[ConvexHull(uv).vertices]
-    except (QhullError, ValueError):
-        return uv
+    outline = convex_hull(uv)
+    return uv if outline is None else uv[outline.vertices]
 
 
 def _grid_shape(uv: NDArray[np.float64]) -> tuple[int, int]:
@@ -231,5 +228,5 @@ def model_from_values(values: Mapping[str, Any], image_size: tuple[int, int]) ->
         train_duv=values['train_duv'],
         noise_px=values['noise_px'],
         bias_px=values['bias_px'],
-        series=series_from_values(image_size, values),
+        series=unpacked(image_size, *(values[name] for name in SERIES_FIELDS)),
     )

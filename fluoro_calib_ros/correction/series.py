@@ -12,7 +12,6 @@ Statistics and Computing 30, 2020).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb
@@ -23,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from .calibration_record import MAX_DEGREE, MAX_MODES, SD_GRID
-from .terms import CUBIC, ring_coefficients
+from .terms import CUBIC, polynomial_powers, ring_coefficients
 
 MARGIN = 1.3  # size of the rectangle at whose border the sines vanish, relative to the image
 RING_DEGREE = CUBIC + 2  # degree of the first radial polynomial beyond a cubic trend
@@ -50,7 +49,7 @@ class Functions:
     @cached_property
     def powers(self) -> list[tuple[int, int]]:
         """Exponents (i, j) of the polynomials x^i y^j."""
-        return [(i, j) for i in range(self.degree + 1) for j in range(self.degree + 1 - i)]
+        return polynomial_powers(self.degree)
 
     @cached_property
     def _sines(self) -> NDArray[np.int64]:
@@ -284,12 +283,7 @@ class Series:
 
     def sd_at(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Return interpolated standard deviations (n,) [px] of the corrections at uv (n, 2)."""
-        place = (
-            (np.asarray(uv, dtype=float) + 0.5)
-            / np.asarray(self.functions.image_size)
-            * (SD_GRID - 1)
-        )
-        return map_coordinates(self.sd, place[:, ::-1].T, order=1, mode='nearest')
+        return at_sd_grid(self.sd, uv, self.functions.image_size)
 
 
 def without_absent_bands(
@@ -306,6 +300,10 @@ def without_absent_bands(
         return functions, coefficients
     out = replace(functions, absent=absent)
     return out, out.converted(functions, coefficients.ravel()).reshape(2, -1)
+
+
+# Fields of a calibration's record that define a series, in the order of `packed`.
+SERIES_FIELDS = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
 
 
 def packed(series: Series | None) -> tuple[int, int, NDArray[np.float64], NDArray[np.float64]]:
@@ -348,15 +346,12 @@ def unpacked(
     return Series(functions, coefficients, sd)
 
 
-def series_from_values(image_size: tuple[int, int], content: Mapping[str, Any]) -> Series | None:
-    """Return the Series, or None, of `CorrectionModel.to_values`. Raises ValueError."""
-    return unpacked(
-        image_size,
-        content['series_degree'],
-        content['series_modes'],
-        content['series_coefficients'],
-        content['series_sd'],
-    )
+def at_sd_grid(
+    grid: NDArray[np.float64], uv: ArrayLike, image_size: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Interpolate a grid (33, 33) over an image at pixels uv (n, 2); returns (n,)."""
+    place = (np.asarray(uv, dtype=float) + 0.5) / np.asarray(image_size) * (SD_GRID - 1)
+    return map_coordinates(grid, place[:, ::-1].T, order=1, mode='nearest')
 
 
 def sd_grid_pixels(image_size: tuple[int, int]) -> NDArray[np.float64]:

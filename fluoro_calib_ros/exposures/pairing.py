@@ -13,6 +13,7 @@ limited time.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from bisect import bisect_left, insort
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -108,27 +109,6 @@ class RecordedPairing:
         )
 
 
-class Pairer(Protocol):
-    """Interface of pairers, which combine frames into exposures."""
-
-    fluoroscopes: tuple[str, ...]
-    unpaired: dict[str, int]  #: number of frames that belong to no exposure, by fluoroscope
-    late: dict[str, int]  #: number of those frames that arrived too late for their exposure
-    incomplete: int  #: number of exposures without a frame of every fluoroscope
-    silent: frozenset[str]  #: fluoroscopes that are no longer waited for
-    stamps: StampAgreement  #: comparison of stamps of frames that were paired by number
-    tolerance: StampTolerance  #: tolerance of frames that are paired by stamp
-
-    def add(self, frame: PairableFrame) -> Sequence[Exposure]:
-        """Add a frame; return the exposures that are now ready."""
-
-    def use(self, options: PairingOptions) -> None:
-        """Change the limits from now on. Raises ValueError if pair_by differs."""
-
-    def flush(self) -> Sequence[Exposure]:
-        """Stop waiting; return the exposures that were still waiting for a frame."""
-
-
 def exposure_pairer(fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> Pairer:
     """Return a pairer for a reconstruction with these fluoroscopes.
 
@@ -163,16 +143,19 @@ def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> 
     return pairer.stamps.disagreement()
 
 
-class _Counts:
-    """Common options and counters of the pairers; see Pairer."""
+class Pairer(ABC):
+    """Combines frames into exposures; options and counters that all pairers have."""
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
         options = options or PairingOptions()
         self.fluoroscopes = tuple(fluoroscopes)
+        #: number of frames that belong to no exposure, by fluoroscope, and how many of them
+        #: arrived too late for theirs
         self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
         self.late = dict.fromkeys(self.fluoroscopes, 0)
-        self.incomplete = 0
-        self.silent: frozenset[str] = frozenset()
+        self.incomplete = 0  #: number of exposures without a frame of every fluoroscope
+        self.silent: frozenset[str] = frozenset()  #: fluoroscopes that are no longer waited for
+        #: comparison of stamps of frames that are paired by number; tolerance of the others
         self.stamps = StampAgreement(self.fluoroscopes)
         self.tolerance = StampTolerance(options.tolerance_ns)
         # Latest frame of each stream.
@@ -187,6 +170,14 @@ class _Counts:
             raise ValueError('pair_by cannot change while frames are being paired')
         self.tolerance.largest_ns = options.tolerance_ns
         self._max_waiting = options.waiting
+
+    @abstractmethod
+    def add(self, frame: PairableFrame) -> Sequence[Exposure]:
+        """Add a frame; return the exposures that are now ready."""
+
+    @abstractmethod
+    def flush(self) -> Sequence[Exposure]:
+        """Stop waiting; return the exposures that were still waiting for a frame."""
 
     @property
     def _reach(self) -> int:
@@ -231,7 +222,7 @@ class _Counts:
         return {name: replace(frame, number=self._exposures) for name, frame in exposure.items()}
 
 
-class CompletePairer(_Counts):
+class CompletePairer(Pairer):
     """Pairer of exposures with a frame of every fluoroscope.
 
     Frames are matched by number, or by stamp within the tolerance. The last `waiting` frames of
@@ -343,7 +334,7 @@ class CompletePairer(_Counts):
         return ()
 
 
-class PartialPairer(_Counts):
+class PartialPairer(Pairer):
     """Pairer of exposures with frames of at least two of three or more fluoroscopes.
 
     Each exposure is returned once, in the order of time. Frames are matched by number, or by

@@ -72,14 +72,6 @@ def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
     """
     present = [view for view in views if view is not None]
     first = present[0].target_id
-    if len(present) == len(views) and all(_equal(first, view.target_id) for view in present[1:]):
-        return MatchedViews(
-            first,
-            np.array([view.uv for view in present], dtype=float).reshape(len(views), -1, 2),
-            np.array([view.sigma for view in present], dtype=float),
-            np.array([view.correction_sd for view in present], dtype=float),
-            np.array([view.outside for view in present], dtype=bool),
-        )
     if all(_equal(first, view.target_id) for view in present[1:]):
         target_id = first
         rows: list[NDArray[np.int64] | slice] = [slice(None)] * len(present)

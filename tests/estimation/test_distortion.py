@@ -146,7 +146,7 @@ def test_local_linear_reproduces_cubic_polynomials():
 
 def test_knn_has_no_trend_and_local_linear_a_cubic_one():
     """The mean of neighbours is the model of the paper, which has no trend."""
-    assert KnnModel.trend_degree is None and len(Trend(None, training()[0])) == 0
+    assert KnnModel.trend_degree == -1 and len(Trend(-1, training()[0])) == 0
     assert len(Trend(LocalLinearModel.trend_degree, training()[0])) == 10
     assert least_squares_map(np.zeros((5, 0))).shape == (0, 5)
 

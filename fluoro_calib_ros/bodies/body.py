@@ -162,6 +162,14 @@ def _declared_body(text: str) -> Body:
     return Body(name.strip(), np.array(target_id), unknown, np.full(count, np.inf))
 
 
+def padded(arrays: Sequence[np.ndarray], fill: float | bool) -> np.ndarray:
+    """Stack arrays (m, ...) of bodies with different numbers of markers, filled up at the end."""
+    out = np.full((len(arrays), max(map(len, arrays)), *arrays[0].shape[1:]), fill)
+    for row, array in zip(out, arrays):
+        row[: len(array)] = array
+    return out
+
+
 def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
     """Return bodies without the markers whose places are unknown.
 

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,25 +31,24 @@ class ImagePoints:
 
 @dataclass(frozen=True)
 class Linear:
-    """Image points at a pose: residuals (B, M, F, 2) and derivatives by place (B, M, F, 2, 3)."""
+    """Image points at a pose: residuals (..., F, 2) and derivatives by place (..., F, 2, 3)."""
 
     residual: NDArray[np.float64]
     by_place: NDArray[np.float64]
-    uv: NDArray[np.float64]  # predicted
-    by_pose: NDArray[np.float64]  # (B, M, 3, 6), derivatives D of places with respect to the pose
-    valid: NDArray[np.bool_]  # (B, M, F), whether seen, and the marker in front of the source
+    by_orientation: Callable[[], NDArray[np.float64]]  # (..., F, 2, 9), by T, w, xp, yp, c
+    by_pose: NDArray[np.float64]  # (..., 3, 6), derivatives D of places with respect to the pose
+    valid: NDArray[np.bool_]  # (..., F), whether seen, and the marker in front of the source
 
 
-class BodyCameras:
+class BodyCameras(Cameras):
     """Fluoroscopes of a rig and their views of the markers of bodies.
 
     target_id: (B, M) markers of B bodies; -1 pads bodies with fewer markers.
     """
 
     def __init__(self, orientation: RigOrientation, target_id: NDArray[np.int64]) -> None:
+        super().__init__(orientation)
         self.target_id = target_id
-        self._cameras = Cameras(orientation)
-        self.root = self._cameras.root
         self._ids: NDArray[np.integer] | None = None
         self._rows = np.zeros(0, dtype=int)
 
@@ -62,9 +63,9 @@ class BodyCameras:
             known = (ids[rows] == self.target_id.ravel()) if len(ids) else rows >= 0
             self._rows = np.where(known, rows, len(ids))
             self._ids = ids
-        shape = (*self.target_id.shape, self._cameras.count)
+        shape = (*self.target_id.shape, self.count)
         # One additional row for markers that are not present.
-        padded = np.full((self._cameras.count, len(ids) + 1, 4), np.nan)
+        padded = np.full((self.count, len(ids) + 1, 4), np.nan)
         padded[:, :-1, :2] = views.uv
         padded[:, :-1, 2] = views.sigma
         padded[:, :-1, 3] = views.correction_sd
@@ -88,28 +89,27 @@ class BodyCameras:
         )
         return xyz[self._rows].reshape(*self.target_id.shape, 3)
 
-    def linear(
-        self,
-        xyz: NDArray[np.float64],
-        pose: tuple[NDArray[np.float64], NDArray[np.float64]],
-        points: ImagePoints,
-    ) -> Linear:
-        """Return residuals and derivatives of all image points at given poses.
 
-        xyz (B, M, 3): markers relative to the centre of their body. pose: rotations (B, 3, 3) and
-        centres (B, 3).
-        """
-        rotation, centre = pose
-        arm = xyz @ np.swapaxes(rotation, 1, 2)
-        image = self._cameras.image(arm + centre[:, None])
-        depth = np.where(image[..., 2] > 0, image[..., 2], np.nan)
-        uv = np.where(depth[..., None] > 0, image[..., :2] / depth[..., None], 0.0)
-        by_place = self._cameras.by_place(uv, depth)
-        valid = points.seen & np.isfinite(depth)
-        residual = np.where(valid[..., None], points.uv - uv, 0.0)
-        by_place = np.where(valid[..., None, None], by_place, 0.0)
-        return Linear(residual, by_place, uv, by_pose(arm), valid)
+def linear_at(
+    cameras: Cameras,
+    xyz: NDArray[np.float64],
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]],
+    uv: NDArray[np.float64],
+    seen: NDArray[np.bool_],
+) -> Linear:
+    """Return residuals and derivatives of image points uv (..., M, F, 2) at given poses.
 
-    def by_orientation(self, linear: Linear) -> NDArray[np.float64]:
-        """Return derivatives (B, M, F, 2, 9) by T, w, xp, yp, c."""
-        return self._cameras.by_orientation(linear.uv, linear.by_place)
+    xyz (..., M, 3): markers relative to the centre of their body. pose: rotations (..., 3, 3) and
+    centres (..., 3). seen (..., M, F).
+    """
+    rotation, centre = pose
+    arm = xyz @ np.swapaxes(rotation, -1, -2)
+    image = cameras.image(arm + centre[..., None, :])
+    depth = np.where(image[..., 2] > 0, image[..., 2], np.nan)
+    predicted = np.where(depth[..., None] > 0, image[..., :2] / depth[..., None], 0.0)
+    by_place = cameras.by_place(predicted, depth)
+    valid = seen & np.isfinite(depth)
+    residual = np.where(valid[..., None], uv - predicted, 0.0)
+    by_place = np.where(valid[..., None, None], by_place, 0.0)
+    by_orientation = partial(cameras.by_orientation, predicted, by_place)
+    return Linear(residual, by_place, by_orientation, by_pose(arm), valid)

@@ -38,8 +38,8 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import cross_matrix, vector_from_matrix
 from ..photogrammetry.unknowns import POSE_SIZE, SINGULAR
 from ..reconstruction.reconstruct import IntersectedViews
-from .body import Body, robust_pose
-from .image_points import BodyCameras, ImagePoints, Linear
+from .body import Body, padded, robust_pose
+from .image_points import BodyCameras, ImagePoints, Linear, linear_at
 from .motion import EYE_3, EYE_6, PoseInformation, turn_of_twists, twist_between
 
 MAX_STEPS = 8  # maximum number of Gauss-Newton steps
@@ -142,17 +142,10 @@ class PoseSolver:
     ) -> None:
         self.bodies = tuple(bodies)
         self.orientation = orientation
-        max_markers = max(len(body.target_id) for body in bodies)
-        shape = (len(bodies), max_markers)
-        self.target_id = np.full(shape, -1)
+        self.target_id = padded([body.target_id for body in bodies], -1)
         self.centre = np.array([body.centre for body in bodies])
-        self.xyz = np.zeros((*shape, 3))
-        self.variance = np.zeros(shape)
-        for row, body in enumerate(bodies):
-            count = len(body.target_id)
-            self.target_id[row, :count] = body.target_id
-            self.xyz[row, :count] = body.xyz_mm - self.centre[row]
-            self.variance[row, :count] = body.sd_mm**2
+        self.xyz = padded([body.xyz_mm - body.centre for body in bodies], 0.0)
+        self.variance = padded([body.sd_mm**2 for body in bodies], 0.0)
         self._variance_3 = self.variance[..., None, None]
         self.cameras = BodyCameras(orientation, self.target_id)
         # Fraction of each element of a step that remains as the next step.
@@ -266,7 +259,7 @@ class PoseSolver:
         rotation, centre = pose
         weight = _weight(points, used, points.noise + points.correction)
         for _ in range(MAX_STEPS):
-            linear = self.cameras.linear(self.xyz, (rotation, centre), points)
+            linear = linear_at(self.cameras, self.xyz, (rotation, centre), points.uv, points.seen)
             marker = self._marker(linear, weight)
             normal, right = _sum(marker, linear.by_pose)
             parts = _eigen(normal)
@@ -461,7 +454,7 @@ def _squares_by_rig(
     by_place = linear.by_place[rows]
     d = linear.by_pose[rows]
     weighted = np.swapaxes(by_place * weight[..., None, None], 3, 4)
-    by_rig = solver.cameras.by_orientation(linear)[rows] @ solver.cameras.root  # (S, M, F, 2, k)
+    by_rig = linear.by_orientation()[rows] @ solver.cameras.root  # (S, M, F, 2, k)
     by_marker = np.swapaxes(d, 2, 3) @ solution.marker.m[rows]
     right = (by_marker @ (weighted @ by_rig).sum(axis=2)).sum(axis=1)
     unit, scale = _of_unit_diagonal(normal[rows])
@@ -562,9 +555,7 @@ def _covariances(
     gain_transposed = np.swapaxes(gain, 2, 3)
     noise = inverse @ (gain @ (flat @ by_noise) @ gain_transposed).sum(axis=1) @ inverse
     fixed = inverse @ (gain @ steady @ gain_transposed).sum(axis=1) @ inverse
-    by_view = (gain[:, :, None] @ (weighted_transposed @ cameras.by_orientation(linear))).sum(
-        axis=1
-    )
+    by_view = (gain[:, :, None] @ (weighted_transposed @ linear.by_orientation())).sum(axis=1)
     rig_root = -inverse @ (by_view @ cameras.root).sum(axis=1)
     return noise, fixed, rig_root
 

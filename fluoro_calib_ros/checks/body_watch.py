@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, erfc
 
-from ..bodies.body import Body, check_bodies, fitted_pose
-from ..bodies.image_points import BodyCameras, ImagePoints, Linear
+from ..bodies.body import Body, check_bodies, fitted_pose, padded
+from ..bodies.image_points import BodyCameras, ImagePoints, Linear, linear_at
 from ..bodies.pose import marker_sums
 from ..bodies.shapes import REGULAR, learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -113,18 +113,11 @@ class BodyWatch:
     def _set_bodies(self, bodies: Sequence[Body]) -> None:
         """Set the shapes; markers whose places are not known yet are ignored."""
         self.bodies = tuple(bodies)
-        shape = (len(bodies), max(len(body.target_id) for body in bodies))
-        target_id = np.full(shape, -1)
-        self._xyz = np.zeros((*shape, 3))
-        self._variance = np.zeros(shape)
-        self._known = np.ones(shape, dtype=bool)  # padding without a marker counts as known
-        for row, body in enumerate(bodies):
-            columns = slice(len(body.target_id))
-            known = body.known
-            target_id[row, columns] = body.target_id
-            self._known[row, columns] = known
-            self._xyz[row, columns] = np.where(known[:, None], body.xyz_mm, 0.0)
-            self._variance[row, columns] = np.where(known, body.sd_mm, 0.0) ** 2
+        target_id = padded([body.target_id for body in bodies], -1)
+        known = [body.known for body in bodies]
+        self._known = padded(known, True)  # padding without a marker counts as known
+        self._xyz = np.where(self._known[..., None], padded([b.xyz_mm for b in bodies], 0.0), 0.0)
+        self._variance = np.where(self._known, padded([b.sd_mm for b in bodies], 0.0), 0.0) ** 2
         self._cameras = BodyCameras(self._orientation, target_id)
 
     def add(self, exposure: IntersectedViews) -> None:
@@ -184,7 +177,9 @@ class BodyWatch:
         places = np.nan_to_num(np.stack([exposure.places[row] for exposure in seen]))
         weight = np.where(points.seen, 1 / points.noise, 0.0)
         identity = (np.eye(3)[None], np.zeros((1, 3)))
-        information, _ = marker_sums(self._cameras.linear(places, identity, points), weight)
+        information, _ = marker_sums(
+            linear_at(self._cameras, places, identity, points.uv, points.seen), weight
+        )
         known = np.asarray(np.isfinite(xyz).all(axis=2))
         known_information = np.where(known[..., None, None], information[:, :count], np.eye(3))
         covariance = np.linalg.inv(known_information)
@@ -210,7 +205,7 @@ class BodyWatch:
         points = replace(points, seen=points.seen & has_marker[..., None])
         places = np.where(has_marker[..., None], seen.places[rows], 0.0)
         pose = fitted_pose(self._xyz[body], places, has_marker.astype(float))
-        linear = self._cameras.linear(self._xyz[body], pose, points)
+        linear = linear_at(self._cameras, self._xyz[body], pose, points.uv, points.seen)
         drift = _Drift.of(linear, points, self._variance[body])
         inside = self._inside(points)
         statistics = _by_area(drift, self._clipped(drift), inside)

@@ -31,14 +31,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.body import Body
+from ..bodies.body import Body, padded
 from ..bodies.correction_errors import covariance_of_means
-from ..bodies.image_points import BodyCameras, ImagePoints
+from ..bodies.image_points import linear_at
 from ..correction.series import MARGIN, Functions
 from ..correction.terms import CUBIC
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from ..photogrammetry.unknowns import POSE_SIZE
+from ..reconstruction.cameras import Cameras
 from .sizes import ChangeStatistics
 
 FALSE_SHARE = 0.01  # expected share of false matches among the image points
@@ -191,13 +192,9 @@ class RigAdjustment:
         self.bodies = tuple(bodies)
         self.functions = [Functions(size, CUBIC, DRIFT_MODES) for size in image_size]
         self._area = np.array([float(w * h) for w, h in image_size])
-        count = max(len(body.target_id) for body in bodies)
-        self.target_id = np.full((len(bodies), count), -1)
-        self.xyz = np.zeros((len(bodies), count, 3))
-        for row, body in enumerate(bodies):
-            stop = len(body.target_id)
-            self.target_id[row, :stop] = body.target_id
-            self.xyz[row, :stop] = body.xyz_mm - body.centre
+        self.target_id = padded([body.target_id for body in bodies], -1)
+        self.xyz = padded([body.xyz_mm - body.centre for body in bodies], 0.0)
+        count = self.target_id.shape[1]
         self._of_shapes = [_shape_covariance(body, count) for body in bodies]
         self._views = len(orientation.fluoroscopes)
         sizes = [
@@ -575,23 +572,16 @@ class LinearPoints:
     ) -> LinearPoints:
         """Linearise at values of the unknowns and at poses."""
         grid = observed.seen.shape  # (T, B, M, F)
-        cameras = BodyCameras(adjustment.rig_at(values), adjustment.target_id)
         shape = adjustment.shapes_at(values)
         valid = observed.seen & poses.known[:, :, None, None]
         bias = values[adjustment.bias].reshape(*grid[1:], 2)
-        points = ImagePoints(
-            (observed.uv - bias).reshape(-1, *grid[2:], 2),
-            observed.variance.reshape(-1, *grid[2:]),
-            np.zeros((1, 1, 1)),
-            valid.reshape(-1, *grid[2:]),
-        )
-        xyz = np.broadcast_to(shape, (grid[0], *shape.shape)).reshape(-1, *shape.shape[1:])
-        pose = poses.rotation.reshape(-1, 3, 3), poses.centre_mm.reshape(-1, 3)
-        linear = cameras.linear(xyz, pose, points)
-        by_orientation = cameras.by_orientation(linear)
+        pose = poses.rotation, poses.centre_mm
+        cameras = Cameras(adjustment.rig_at(values))
+        linear = linear_at(cameras, shape, pose, observed.uv - bias, valid)
+        by_orientation = linear.by_orientation()
         rotation_change = values[adjustment.rig].reshape(-1, ORIENTATION_SIZE)[:, 3:6]
         by_orientation[..., 3:6] = by_orientation[..., 3:6] @ _by_vector(rotation_change)
-        residual = linear.residual.reshape(*grid, 2)
+        residual = linear.residual
         coefficients = adjustment.drift_at(values)
         # Evaluate the drift at the image point predicted by the model. At the observed pixel,
         # which has noise, a drift that shrinks the image would also shrink the noise, and be
@@ -603,12 +593,12 @@ class LinearPoints:
         residual = residual - np.where(valid[..., None], _drift(functions, coefficients), 0.0)
         return cls(
             residual,
-            linear.by_place.reshape(*grid, 2, 3),
-            by_orientation.reshape(*grid, 2, ORIENTATION_SIZE),
+            linear.by_place,
+            by_orientation,
             functions,
-            place_by_pose=linear.by_pose.reshape(*grid[:3], 3, POSE_SIZE),
+            place_by_pose=linear.by_pose,
             seen=valid,
-            good=linear.valid.reshape(grid),
+            good=linear.valid,
             shape=shape,
             poses=poses,
         )

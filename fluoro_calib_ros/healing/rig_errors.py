@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.image_points import BodyCameras, ImagePoints
 from ..photogrammetry.network import DATUM_DEFECT, similarity_directions
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.unknowns import POSE_SIZE
+from ..reconstruction.cameras import Cameras
 from .rig_adjustment import RigAdjustment, root_of
 
 
@@ -73,21 +73,19 @@ class _Intersected:
 
     @classmethod
     def of(cls, orientation: RigOrientation, points_mm: NDArray[np.float64]) -> _Intersected:
-        cameras = BodyCameras(orientation, np.zeros((1, len(points_mm)), dtype=int))
-        views = len(orientation.fluoroscopes)
-        shape = (1, len(points_mm), views)
-        empty = ImagePoints(
-            np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape), np.ones(shape, dtype=bool)
-        )
-        linear = cameras.linear(points_mm[None], (np.eye(3)[None], np.zeros((1, 3))), empty)
-        by_place = linear.by_place[0].reshape(len(points_mm), -1, 3)
+        cameras = Cameras(orientation)
+        views = cameras.count
+        image = cameras.image(points_mm)
+        uv = image[..., :2] / image[..., 2:]
+        by_view = cameras.by_place(uv, image[..., 2])
+        by_place = by_view.reshape(len(points_mm), -1, 3)
         by_rig = np.zeros((len(points_mm), views, 2, views, ORIENTATION_SIZE))
-        by_orientation = cameras.by_orientation(linear)[0]
+        by_orientation = cameras.by_orientation(uv, by_view)
         for f in range(views):
             by_rig[:, f, :, f] = by_orientation[:, f]
         transposed = np.swapaxes(by_place, 1, 2)
         by_uv = np.linalg.solve(transposed @ by_place, transposed)
-        return cls(linear.uv[0], by_rig.reshape(*by_rig.shape[:3], -1), by_uv)
+        return cls(uv, by_rig.reshape(*by_rig.shape[:3], -1), by_uv)
 
     def moved(self, derivatives: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the motion of points (3n, k), from derivatives (n, F, 2, k) of their views."""

@@ -677,27 +677,33 @@ def _against_others(
     marker: int,
     markers: Sequence[int],
 ) -> float:
-    """Return the squared deviation of a marker from CT over its variance, fitting the others."""
+    """Return the weighted squares of deviations from CT that a marker adds to those of the others.
+
+    This is its squared deviation from the fit of the others over its variance (Baarda 1968), and
+    remains valid if the others are nearly on a line, about which their fit is hardly determined.
+    """
     others = [k for k in markers if k != marker]
-    weight = 1 / sd[others] ** 2
-    rotation, shift = fitted_pose(adjusted[others], ct[others], weight)
-    arm = np.concatenate([ct[others], ct[[marker]]]) - ct[others].mean(axis=0)
-    motion = by_pose(arm)
-    normal = (np.swapaxes(motion[:-1], 1, 2) @ (motion[:-1] * weight[:, None, None])).sum(axis=0)
-    # Others on a line leave a rotation free, which is then uncertain.
-    normal += REGULAR * normal.max() * np.eye(POSE_SIZE)
-    deviation = rotation @ adjusted[marker] + shift - ct[marker]
-    covariance = sd[marker] ** 2 * np.eye(3) + motion[-1] @ np.linalg.solve(normal, motion[-1].T)
-    return float(deviation @ np.linalg.solve(covariance, deviation))
+    with_marker, without_marker = (
+        _squares_of_fit(ct[rows], adjusted[rows], sd[rows]) for rows in (list(markers), others)
+    )
+    return with_marker - without_marker
+
+
+def _squares_of_fit(
+    ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
+) -> float:
+    """Return the weighted squares of deviations of coordinates (k, 3) fitted to CT."""
+    rotation, shift = fitted_pose(adjusted, ct, 1 / sd**2)
+    return float(np.sum(((adjusted @ rotation.T + shift - ct) / sd[:, None]) ** 2))
 
 
 def _misfit(
     ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> float:
     """Return the weighted squares of a fit of coordinates (k, 3) to CT, over their limit."""
-    rotation, shift = fitted_pose(adjusted, ct, 1 / sd**2)
-    deviation = (adjusted @ rotation.T + shift - ct) / sd[:, None]
-    return float(np.sum(deviation**2) / chdtri(3 * len(ct) - POSE_SIZE, REJECT_TAIL))
+    return _squares_of_fit(ct, adjusted, sd) / float(
+        chdtri(3 * len(ct) - POSE_SIZE, REJECT_TAIL)
+    )
 
 
 def _scale(

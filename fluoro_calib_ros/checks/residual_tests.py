@@ -13,6 +13,7 @@ their scatter gives the limit of their mean (Student's t-test, weighted by the n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -65,6 +66,9 @@ COMMON = _TestPlan(8, 1, FALSE_ALARM, FALSE_ALARM)
 # later exposures of 22 simulated rigs that did not change, in 8800 random orders, each of the two
 # tests fails in 0.03 % (docs/verdict.md).
 CHANGE = _TestPlan(16, 2, 1e-4, 1e-3)
+# Shares of the shortest joins, each half as long as those of the previous share. A ripple makes
+# products of residuals that are further apart than a third of its wavelength cancel.
+SHARES = 0.25 ** np.arange(4)
 
 
 @dataclass(frozen=True)
@@ -207,11 +211,20 @@ def noise_of(
 
 
 def common_trend(residuals: Residuals, image_size: tuple[int, int]) -> ResidualTrend:
-    """Test for a trend that all exposures have in common."""
-    joins = _joins(residuals, COMMON.neighbours)
-    every_pair = np.ones(len(joins.mean), dtype=bool)
+    """Test for a trend that all exposures have in common.
+
+    Ripples are shorter than the distance of neighbours where image points are few. Therefore the
+    shortest joins are tested, too; the size is that of the share that exceeds its limit most, or
+    of all joins if none does.
+    """
+    tests = []
+    for share in SHARES:
+        joins = _joins(residuals, COMMON.neighbours, share)
+        every_pair = np.ones(len(joins.mean), dtype=bool)
+        # Bonferroni over the shares
+        tests.append(_mean_and_limit(joins, every_pair, COMMON.false_alarm / len(SHARES)))
+    squared, limit = max(tests, key=lambda test: max(test[0] - test[1], 0.0))
     every_exposure = np.ones(len(residuals.numbers), dtype=bool)
-    squared, limit = _mean_and_limit(joins, every_pair, COMMON.false_alarm)
     return _trend(squared, limit, _worst_cell(residuals, image_size, every_exposure, COMMON))
 
 
@@ -299,13 +312,18 @@ def rejected_exposure(rejected: Residuals, inliers: Residuals) -> RejectedExposu
     return max(tested, key=lambda exposure: exposure.agreement, default=None)
 
 
-def _joins(residuals: Residuals, neighbours: int) -> Joins:
-    """Return the products of neighbouring residuals of different exposures."""
+def _joins(residuals: Residuals, neighbours: int, share: float = 1.0) -> Joins:
+    """Return the products of neighbouring residuals of different exposures.
+
+    share: share of the shortest joins to use.
+    """
     m = len(residuals.numbers)
     count = min(neighbours + 1, len(residuals.uv))
-    _, nearest = cKDTree(residuals.uv).query(residuals.uv, k=count)
-    i = np.repeat(np.arange(len(nearest)), count - 1)
-    j = nearest[:, 1:].ravel()
+    distance, nearest = cKDTree(residuals.uv).query(residuals.uv, k=count)
+    lengths = distance[:, 1:].ravel()
+    rows = np.argsort(lengths, kind='stable')[: math.ceil(share * lengths.size)]
+    i = np.repeat(np.arange(len(nearest)), count - 1)[rows]
+    j = nearest[:, 1:].ravel()[rows]
     earlier, later = np.sort([residuals.exposure[i], residuals.exposure[j]], axis=0)
     product = np.sum(residuals.r[i] * residuals.r[j], axis=1)
     pair = earlier * m + later

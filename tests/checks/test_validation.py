@@ -466,6 +466,17 @@ def test_trend_is_detected_with_size_and_place():
     )
 
 
+@pytest.mark.parametrize(('wavelength', 'size'), [(25.0, 0.6), (40.0, 0.4), (60.0, 0.4)])
+def test_ripple_shorter_than_the_distance_of_neighbours_is_detected(wavelength, size):
+    def ripple(uv, e):
+        return size * np.sin(2 * np.pi / wavelength * (uv @ (0.6, 0.8)))[:, None] * (0.0, 1.0)
+
+    for seed in range(5):
+        found = common_trend(noise(seed, trend=ripple), SIZE)
+        assert found.size > found.limit
+        assert found.size == pytest.approx(size / 2, rel=0.5)  # RMS of a coordinate
+
+
 def test_change_of_trend_is_detected_with_its_size():
     found = change_of_trend(
         noise(2, trend=lambda uv, e: (e >= 6)[:, None] * (0.2, 0.0) - 0.1), SIZE

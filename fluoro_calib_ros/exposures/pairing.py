@@ -34,6 +34,7 @@ from .stamps import (
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # minimum number of views for an intersection
 PATIENCE = 32  # in frames: a stall of 32 ms at 1000 Hz
+REPEATS = 16  # number of newest frames of a stream that another publisher may repeat
 UNLIMITED = 10**9  # frames
 
 # Frames by fluoroscope: dataclasses with the fields of PairableFrame.
@@ -230,7 +231,8 @@ class CompletePairer(Pairer):
     unpaired. A frame that arrives after one of its partners was displaced counts as late and as
     unpaired. Exposures may become ready in another order than that of their frames. A stream that
     restarts discards the waiting frames from before, so that they do not become partners of later
-    ones. Raises ValueError for an unknown pair_by.
+    ones. A frame that is received again, as when two nodes publish the same stream, counts as
+    late. Raises ValueError for an unknown pair_by.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
@@ -242,6 +244,10 @@ class CompletePairer(Pairer):
         self._stamps: dict[str, list[int]] = {name: [] for name in self.fluoroscopes}
         # Key of the last displaced frame.
         self._displaced: dict[str, int | None] = dict.fromkeys(self.fluoroscopes)
+        # Keys and stamps of the newest frames.
+        self._newest: dict[str, deque[tuple[int, int]]] = {
+            name: deque(maxlen=REPEATS) for name in self.fluoroscopes
+        }
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
         """Add a frame; return the exposure that it completes, if any."""
@@ -253,9 +259,12 @@ class CompletePairer(Pairer):
             self._discard_before(frame)
         if order is not Order.LATE:
             self._latest[name] = frame
-        if self._is_late(name, key):
+        newest = self._newest[name]
+        is_repeated = order is Order.LATE and (key, frame.stamp_ns) in newest and frame.stamp_ns
+        if is_repeated or self._is_late(name, key):
             self._count_late(name)
             return ()
+        newest.append((key, frame.stamp_ns))
         if key in waiting:
             self.unpaired[name] += 1  # the previous frame with the same key, which is replaced
         elif not self._by_number:

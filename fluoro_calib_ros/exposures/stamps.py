@@ -107,7 +107,8 @@ class StampAgreement:
     def disagreement(self) -> str:
         """Return a sentence if the frames of an exposure are far apart in time, otherwise ''.
 
-        A constant offset between the clocks has the same effect; the sentence says so.
+        A constant offset between the clocks has the same effect; the sentence says so. Another
+        sentence says that frames are not numbered.
         """
         first, *others = self._fluoroscopes
         for other in others:
@@ -125,6 +126,11 @@ class StampAgreement:
         if len(rows) < MIN_EXPOSURES:
             return ''
         number, first, second = np.array(rows, dtype=np.int64).T
+        if not np.ptp(number) and np.ptp(first):
+            return (
+                f'frames of {one} are not numbered: {len(rows)} in a row have the number '
+                f'{number[0]}, but different stamps; pair frames by stamp'
+            )
         interval = _frame_interval(number, first)
         offset = (second - first).astype(float)
         typical = float(np.median(np.abs(offset)))

@@ -341,6 +341,26 @@ def test_repeated_and_unordered_frames_are_late(by):
 
 
 @pytest.mark.parametrize('names', ['ab', 'abc'])
+@pytest.mark.parametrize('by', BY)
+@pytest.mark.parametrize('behind', [0, 1, 5])
+def test_an_exposure_that_two_nodes_publish_is_paired_once(by, names, behind):
+    """The second node publishes the same frames, `behind` exposures after the first one."""
+    pairer = exposure_pairer(names, PairingOptions(by, 0.001))
+    rows = [row for n in range(1, 60) for row in (n, n - behind) if row > 0]
+    frames = [frame(name, row) for row in rows for name in names]
+    assert [row for row, _ in paired(pairer, frames)] == list(range(1, 60))
+    assert set(pairer.late.values()) == {len(rows) - 59}
+    assert pairer.late == pairer.unpaired
+
+
+@pytest.mark.parametrize('names', ['ab', 'abc'])
+def test_frames_without_stamps_are_not_taken_for_repeated_ones(names):
+    pairer = exposure_pairer(names)
+    frames = [replace(frame(name, row), stamp_ns=0) for row in range(30) for name in names]
+    assert len(paired(pairer, frames)) == 30
+
+
+@pytest.mark.parametrize('names', ['ab', 'abc'])
 def test_a_lost_frame_does_not_shift_later_ones_if_the_tolerance_is_too_large(names):
     """At 1000 Hz the default tolerance of 2 ms covers two frame intervals."""
     pairer = exposure_pairer(names, PairingOptions('stamp'))

@@ -90,17 +90,20 @@ def test_pairing_by_stamp_has_no_disagreement():
     assert not pairer.stamps.disagreement()
 
 
-def test_numbers_that_never_grow_give_no_frame_interval():
-    """A camera sends the same number again and again, so its frames cannot be told apart."""
+@pytest.mark.parametrize('delay_ms', [0, 40])
+def test_numbers_that_never_grow_are_told_and_give_no_frame_interval(delay_ms):
+    """A driver does not number frames, so that those of one exposure cannot be told apart."""
     repeated = {
-        name: [Frame(name, 1, frame.stamp_ns) for frame in stream(name, delay_ns=delay)]
-        for name, delay in (('a', 0), ('b', INTERVAL))
+        name: [Frame(name, 7, frame.stamp_ns) for frame in stream(name, delay_ns=delay * MS)]
+        for name, delay in (('a', 0), ('b', delay_ms))
     }
     pairer = CompletePairer('ab')
     for pair in zip(*repeated.values()):
         for frame in pair:
             pairer.add(frame)
-    assert not pairer.stamps.disagreement()
+    found = pairer.stamps.disagreement()
+    assert found.startswith('frames of a are not numbered: 20 in a row have the number 7')
+    assert found.endswith('pair frames by stamp')
     number, stamp_ns = np.array([5, 5, 4]), np.array([10, 20, 30])
     assert _frame_interval(number, stamp_ns) == 0
     assert _frame_interval(np.array([5, 7, 6, 8]), np.array([10, 30, 40, 90])) == 17.5

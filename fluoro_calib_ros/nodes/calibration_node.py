@@ -36,12 +36,19 @@ from .calibration_settings import (
     CalibrationSettings,
     read_rig,
 )
-from .exposure_input import RADIOGRAPH, CollectServices, ExposureInput, NodeParts
+from .exposure_input import (
+    RADIOGRAPH,
+    CollectServices,
+    ExposureInput,
+    NodeParts,
+    PhantomStream,
+)
 from .frame_validation import with_limit
 from .healing_services import Healing
 from .messages.observations import ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
-from .runtime.diagnostics import RefusalLog, Status, health_of
+from .runtime.conditions import health_of, state_of
+from .runtime.diagnostics import RefusalLog, Status
 from .runtime.lifecycle import StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import declare_groups, declare_read_limits, follow_groups
@@ -180,31 +187,24 @@ class CalibrationNode(StreamNode):
 
     def diagnose(self) -> list[Status]:
         """Return the diagnostic status of every fluoroscope, and publish its CalibrationStatus."""
-        incompatible = self.incompatible_publishers()
-        statuses = [self._diagnose(name, incompatible) for name in self._rig.names]
+        statuses = [self._diagnose(stream) for stream in self._exposures.streams.values()]
         return [*statuses, *self._learning.diagnose()]
 
-    def _diagnose(self, name: str, incompatible: Mapping[str, str]) -> Status:
+    def _diagnose(self, stream: PhantomStream) -> Status:
+        name = stream.name
         progress = self._progress_of(name)
         self._output.publish_status(progress)
-        stream = self._exposures.streams[name]
-        state = FluoroscopeState(
-            node=self,
-            topics=(f'{name}/{OBSERVATIONS}',),
-            refusals=stream.refusals,
-            incompatible=incompatible,
-            recent=self.recent.growth(
-                name,
-                refused=stream.refusals.total,
-                overrun=stream.overrun,
-                unpaired=progress.collected.unpaired,
-            ),
-            stream=stream,
-            subject='target observations',
+        state = state_of(
+            FluoroscopeState,
+            self,
+            stream,
+            [OBSERVATIONS],
+            'target observations',
+            counts={'unpaired': progress.collected.unpaired},
             progress=progress,
             output=self._output,
             disagreement=self._exposures.disagreement(),
-            angle=self._angles.health(name, incompatible),
+            angle=self._angles.health(name, self.incompatible),
         )
         orientation = self._output.orientation
         verdict = self._output.verdict(name)

@@ -24,19 +24,10 @@ from .messages.fluoroscope_calibration import message_from_calibration
 from .messages.image import colour_message
 from .messages.rig_orientation import message_from_orientation
 from .messages.status import FluoroscopeProgress, message_from_progress
-from .runtime.diagnostics import OK, Health, fault, warning
-from .runtime.lifecycle import (
-    StreamNode,
-    StreamState,
-    inactive_node,
-    incompatible_publisher,
-    lost_messages,
-    missing_publisher,
-    overrun_input,
-    refused_messages,
-    several_nodes,
-    unpaired_frames,
-)
+from .runtime import conditions
+from .runtime.conditions import StreamState, fails, missing_publisher, warns
+from .runtime.diagnostics import OK, Health
+from .runtime.lifecycle import StreamNode
 from .runtime.topics import latched_qos
 
 
@@ -145,47 +136,19 @@ class FluoroscopeState(StreamState):
     angle: Health | None  #: warning if the angle of the C-arm is unknown
 
 
-def nothing_loaded(state: FluoroscopeState) -> Health | None:
-    """Report that the saved calibrations could not be loaded at the start."""
-    reason = state.output.load_fault
-    return fault(reason and f'no calibration loaded: {reason}')
-
-
-def nothing_saved(state: FluoroscopeState) -> Health | None:
-    """Report that the calibration in use could not be saved."""
-    return fault(state.output.save_fault)
-
-
-def refused_calibration(state: FluoroscopeState) -> Health | None:
-    """Report that the last self-calibration gave no calibration."""
+def _refused_calibration(state: FluoroscopeState) -> str:
+    """Return why the last self-calibration gave no calibration, '' if it gave one."""
     reason = state.output.refused.get(state.stream.name, '')
     in_use = state.progress.calibration_id or 'no calibration'
-    return fault(reason and f'the last calibration was refused: {reason}; {in_use} is in use')
+    return reason and f'the last calibration was refused: {reason}; {in_use} is in use'
 
 
-def never_published(state: FluoroscopeState) -> Health | None:
-    """Report that nobody publishes frames, or has ever done so."""
-    return None if state.stream.received else missing_publisher(state)
-
-
-def distant_stamps(state: FluoroscopeState) -> Health | None:
-    """Warn if stamps show that pairs may be wrong."""
-    return warning(state.disagreement)
-
-
-def unknown_angle(state: FluoroscopeState) -> Health | None:
-    """Warn if the angle of the C-arm is unknown."""
-    return state.angle
-
-
-def failed_verdict(state: FluoroscopeState) -> Health | None:
-    """Warn if the calibration in use has failed its verdict."""
+def _failed_verdict(state: FluoroscopeState) -> str:
+    """Return a message if the calibration in use has failed its verdict."""
     verdict = state.output.verdict(state.stream.name)
     if verdict.verdict != 'fail':
-        return None
-    return warning(
-        ': '.join(['the calibration in use has failed its verdict', *verdict.findings[:1]])
-    )
+        return ''
+    return ': '.join(['the calibration in use has failed its verdict', *verdict.findings[:1]])
 
 
 def working(state: FluoroscopeState) -> Health:
@@ -198,19 +161,24 @@ def working(state: FluoroscopeState) -> Health:
 
 
 CONDITIONS = (
-    lost_messages,
-    incompatible_publisher,
-    several_nodes,
-    nothing_loaded,
-    nothing_saved,
-    refused_calibration,
-    inactive_node,
-    never_published,
-    overrun_input,
-    unpaired_frames,
-    refused_messages,
-    distant_stamps,
-    unknown_angle,
-    failed_verdict,
+    conditions.lost_messages,
+    conditions.incompatible_publisher,
+    conditions.several_nodes,
+    fails(
+        lambda state: (
+            state.output.load_fault and f'no calibration loaded: {state.output.load_fault}'
+        )
+    ),
+    fails(lambda state: state.output.save_fault),
+    fails(_refused_calibration),
+    conditions.inactive_node,
+    # Nobody publishes frames, or has ever done so.
+    warns(lambda state: '' if state.stream.received else missing_publisher(state)),
+    conditions.overrun_input,
+    conditions.unpaired_frames,
+    conditions.refused_messages,
+    warns(lambda state: state.disagreement),
+    lambda state: state.angle,
+    warns(_failed_verdict),
     working,
 )

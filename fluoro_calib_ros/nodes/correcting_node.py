@@ -16,29 +16,10 @@ from ..exposures.angles import AngleOptions
 from ..io.calibration import SUFFIX, disagreements, load_calibrations
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
-from .runtime.diagnostics import (
-    Health,
-    RefusalLog,
-    Status,
-    health_of,
-    healthy,
-    one_line,
-    warning,
-)
-from .runtime.lifecycle import (
-    Stream,
-    StreamNode,
-    StreamState,
-    inactive_node,
-    incompatible_publisher,
-    lost_messages,
-    missing_publisher,
-    overrun_input,
-    refused_messages,
-    several_nodes,
-    stalled_stream,
-    stream_faults,
-)
+from .runtime import conditions
+from .runtime.conditions import StreamState, health_of, healthy, state_of, warns
+from .runtime.diagnostics import WARN, Health, RefusalLog, Status, one_line
+from .runtime.lifecycle import Stream, StreamNode, stream_faults
 from .runtime.parameters import CalibratedParameters, expand_path
 from .runtime.streams import FaultHandlers
 
@@ -52,6 +33,7 @@ class CorrectedStream(Stream):
         super().__init__(name, refusals)
         self.corrected = 0  #: number of corrected frames or images
         self.waiting = 0  #: number that came before the first calibration
+        self.refused_calibration = ''  #: why the last one was refused; '' if none was
         #: angle [rad] since the last diagnostics that is far from all calibrated angles
         self.beyond: tuple[float, AngleField] | None = None
 
@@ -65,43 +47,42 @@ class CorrectedStream(Stream):
 class CorrectingState(StreamState):
     """State from which the health of a corrected fluoroscope is diagnosed."""
 
+    node: CorrectingNode
     stream: CorrectedStream
-    item: str  #: corrected item: frame or image
-    beyond: str  #: what becomes of the items at an angle far from all calibrated ones
-    calibrations: CalibrationInput
-    angles: AngleInput
 
 
-def uncalibrated(state: CorrectingState) -> Health | None:
-    """Warn if there is no calibration yet."""
-    if state.calibrations.current(state.stream.name) is not None:
-        return None
-    return warning(f'no calibration yet: {state.stream.waiting} {state.item}s were not corrected')
+def _uncalibrated(state: CorrectingState) -> str:
+    """Return a message if there is no calibration yet, and why the last one was refused."""
+    stream = state.stream
+    if state.node.prepared(stream.name) is not None:
+        return ''
+    text = f'no calibration yet: {stream.waiting} {state.node.item}s were not corrected'
+    return '; '.join(filter(None, (text, stream.refused_calibration)))
 
 
 def doubtful_angle(state: CorrectingState) -> Health | None:
     """Warn if the angle of the C-arm is unknown or far from all calibrated angles."""
     stream = state.stream
-    health = state.angles.health(stream.name, state.incompatible)
+    health = state.node.angles[stream.name].health(stream.name, state.node.incompatible)
     angle_beyond, stream.beyond = stream.beyond, None
     if health:
         return health.with_consequence('the mean correction over all angles is used')
     if angle_beyond is None:
         return None
     angle, field = angle_beyond
-    return warning(f'{beyond_text(angle, field.angles)}: {state.beyond}')
+    return Health(WARN, f'{beyond_text(angle, field.angles)}: {state.node.beyond}')
 
 
 CONDITIONS = (
-    lost_messages,
-    several_nodes,
-    incompatible_publisher,
-    uncalibrated,
-    inactive_node,
-    missing_publisher,
-    stalled_stream,
-    overrun_input,
-    refused_messages,
+    conditions.lost_messages,
+    conditions.several_nodes,
+    conditions.incompatible_publisher,
+    warns(_uncalibrated),
+    conditions.inactive_node,
+    conditions.no_publisher,
+    conditions.stalled_stream,
+    conditions.overrun_input,
+    conditions.refused_messages,
     doubtful_angle,
     healthy('correcting'),
 )
@@ -220,27 +201,15 @@ class CorrectingNode(StreamNode):
     def diagnose(self) -> list[Status]:
         """Return the status of every fluoroscope."""
         self._calibrations.release()
-        incompatible = self.incompatible_publishers()
-        return [self._diagnose(stream, incompatible) for stream in self.streams.values()]
+        return [self._diagnose(stream) for stream in self.streams.values()]
 
     def _on_refused_calibration(self, name: str, reason: str) -> None:
-        self.streams[name].refusals.last_fault = reason
+        stream = self.streams[name]
+        stream.refusals.last_fault = stream.refused_calibration = reason
 
-    def _diagnose(self, stream: CorrectedStream, incompatible: Mapping[str, str]) -> Status:
+    def _diagnose(self, stream: CorrectedStream) -> Status:
         name = stream.name
-        state = CorrectingState(
-            node=self,
-            topics=tuple(f'{name}/{topic}' for topic in self.topics),
-            refusals=stream.refusals,
-            incompatible=incompatible,
-            recent=self.recent.growth(name, refused=stream.refusals.total, overrun=stream.overrun),
-            stream=stream,
-            subject=self.subject,
-            item=self.item,
-            beyond=self.beyond,
-            calibrations=self._calibrations,
-            angles=self.angles[name],
-        )
+        state = state_of(CorrectingState, self, stream, self.topics, self.subject)
         values = {
             f'{self.item}s received': stream.received,
             'lost at the input': stream.overrun,

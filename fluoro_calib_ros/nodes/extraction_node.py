@@ -54,7 +54,8 @@ from .image_stream import (
 )
 from .messages.image import message_from_image, use_single_thread
 from .messages.observations import message_from_frame, uint32_field
-from .runtime.diagnostics import Logger, RefusalLog, StartError, Status, health_of
+from .runtime.conditions import health_of, state_of
+from .runtime.diagnostics import Logger, RefusalLog, StartError, Status
 from .runtime.lifecycle import StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import (
@@ -367,22 +368,13 @@ class ExtractionNode(StreamNode):
 
     def diagnose(self) -> list[Status]:
         """Return the status of every fluoroscope."""
-        incompatible = self.incompatible_publishers()
-        return [self._diagnose(stream, incompatible) for stream in self.streams.values()]
+        return [self._diagnose(stream) for stream in self.streams.values()]
 
-    def _diagnose(self, stream: ImageStream, incompatible: Mapping[str, str]) -> Status:
+    def _diagnose(self, stream: ImageStream) -> Status:
         name = stream.name
         stream.measure()
-        state = ImageState(
-            node=self,
-            topics=tuple(f'{name}/{topic}' for _, topic in self._inputs),
-            refusals=stream.refusals,
-            incompatible=incompatible,
-            recent=self.recent.growth(name, refused=stream.refusals.total, overrun=stream.overrun),
-            stream=stream,
-            subject='images',
-            angles=self._angles,
-        )
+        topics = [topic for _, topic in self._inputs]
+        state = state_of(ImageState, self, stream, topics, 'images', angles=self._angles)
         values = {
             **stream.values(self._workers.waiting(name)),
             'lost at the input': stream.overrun,

@@ -20,18 +20,10 @@ from ..jobs.followers import FollowerSettings, Observations, follower_process
 from ..processes import LentArrays, WorkerProcess
 from .angle_input import AngleInput
 from .messages.image import IMAGE_REFUSALS, ImageConverter
-from .runtime.diagnostics import Health, RefusalLog, Refused, healthy, warning
-from .runtime.lifecycle import (
-    Stream,
-    StreamState,
-    inactive_node,
-    incompatible_publisher,
-    lost_messages,
-    missing_publisher,
-    overrun_input,
-    refused_messages,
-    stalled_stream,
-)
+from .runtime import conditions
+from .runtime.conditions import StreamState, healthy, warns
+from .runtime.diagnostics import Health, RefusalLog, Refused
+from .runtime.lifecycle import Stream
 from .runtime.streams import REMEMBERED
 
 
@@ -141,37 +133,36 @@ class ImageState(StreamState):
     angles: AngleInput
 
 
-def shed_images(state: ImageState) -> Health | None:
-    """Warn if images came faster than they were extracted."""
-    text = f'images come faster than they are extracted: {state.stream.shed} were shed'
-    return warning(text if state.stream.shed_now else '')
-
-
-def empty_image(state: ImageState) -> Health | None:
-    """Warn if the last image gave no observations."""
-    reason = state.stream.last.reason if state.stream.last is not None else ''
-    return warning(reason and f'no observations in the last image: {reason}')
-
-
 def unknown_angle(state: ImageState) -> Health | None:
     """Warn if the angle of the C-arm is needed but unknown."""
-    health = state.angles.health(state.stream.name, state.incompatible)
+    health = state.angles.health(state.stream.name, state.node.incompatible)
     return health and health.with_consequence(
         'markers are predicted by the mean correction over all angles'
     )
 
 
 CONDITIONS = (
-    lost_messages,
-    incompatible_publisher,
-    inactive_node,
-    missing_publisher,
-    stalled_stream,
-    overrun_input,
-    shed_images,
-    empty_image,
+    conditions.lost_messages,
+    conditions.incompatible_publisher,
+    conditions.inactive_node,
+    conditions.no_publisher,
+    conditions.stalled_stream,
+    conditions.overrun_input,
+    warns(
+        lambda state: (
+            state.stream.shed_now
+            and f'images come faster than they are extracted: {state.stream.shed} were shed'
+        )
+    ),
+    warns(
+        lambda state: (
+            state.stream.last
+            and state.stream.last.reason
+            and f'no observations in the last image: {state.stream.last.reason}'
+        )
+    ),
     unknown_angle,
-    refused_messages,
+    conditions.refused_messages,
     healthy('extracting'),
 )
 

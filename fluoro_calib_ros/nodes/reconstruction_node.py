@@ -41,7 +41,8 @@ from .reconstruction_output import (
 )
 from .retractions import PointRetractions
 from .rig_input import BodyFollower, BodyParameters, RigInput, read_body_files
-from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
+from .runtime.conditions import health_of
+from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status
 from .runtime.lifecycle import Stream, StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import (
@@ -342,7 +343,6 @@ class ReconstructionNode(StreamNode):
             node=self,
             topics=tuple(f'{name}/{VIEWS}' for name in self._names),
             refusals=self._refusals,
-            incompatible=self.incompatible_publishers(),
             recent=self._recent(),
             streams=self._streams,
             rigs=self._rigs,

@@ -21,7 +21,6 @@ from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
 from ..bodies.body import STATUS_NAMES, Body, PoseStatus
-from ..bodies.tracking import JointTracker
 from ..exposures.pairing import Pairer
 from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, IntersectedPoints
@@ -45,29 +44,10 @@ from .messages.points import (
 )
 from .retractions import BodyRetractions
 from .rig_input import BodiesState, BodyFollower, RigInput
-from .runtime.diagnostics import (
-    OK,
-    WARN,
-    Health,
-    RecentCounts,
-    Status,
-    counted,
-    fault,
-    health_of,
-    healthy,
-    warning,
-)
-from .runtime.lifecycle import (
-    InputState,
-    Stream,
-    StreamNode,
-    inactive_node,
-    incompatible_publisher,
-    lost_messages,
-    overrun_input,
-    refused_messages,
-    unpaired_frames,
-)
+from .runtime import conditions
+from .runtime.conditions import InputState, counted, fails, health_of, healthy, warns
+from .runtime.diagnostics import OK, WARN, Health, RecentCounts, Status
+from .runtime.lifecycle import Stream, StreamNode
 from .runtime.topics import observations_qos
 
 COUNTED_STATUSES = {
@@ -213,13 +193,6 @@ class ReconstructionState(InputState):
     misses: RecentMisses
 
 
-def no_orientation(state: ReconstructionState) -> Health | None:
-    """Warn if the orientation of the rig is not known yet."""
-    if state.rigs.newest is not None:
-        return None
-    return warning(state.refusals.last_fault or NO_ORIENTATION)
-
-
 def stalled_streams(state: ReconstructionState) -> Health | None:
     """Warn if streams have stopped, and append other faults of the streams."""
     messages = {name: stream.stalled() for name, stream in state.streams.items()}
@@ -231,64 +204,55 @@ def stalled_streams(state: ReconstructionState) -> Health | None:
     return Health(max(level, WARN), '; '.join([*stalled, *other_faults]))
 
 
-def missing_publishers(state: ReconstructionState) -> Health | None:
-    """Warn if nobody publishes the frames of a fluoroscope."""
+def _missing_publishers(state: ReconstructionState) -> str:
+    """Return a message if nobody publishes the frames of a fluoroscope."""
     published = map(state.node.has_publisher, state.topics)
     missing = ', '.join(name for name, live in zip(state.streams, published) if not live)
-    return warning(missing and f'no publisher of corrected observations of {missing}')
+    return missing and f'no publisher of corrected observations of {missing}'
 
 
-def missed_rays(state: ReconstructionState) -> Health | None:
-    """Report that the rays of the views do not intersect."""
+def _missed_rays(state: ReconstructionState) -> str:
+    """Return a message if the rays of the views do not intersect."""
     finding = state.misses.finding()
-    misses = '' if finding is None else finding.sentence
     disagreement = state.pairer.stamps.disagreement()
-    return fault('; '.join(filter(None, (misses, disagreement))) if misses else '')
+    return '; '.join(filter(None, (finding.sentence, disagreement))) if finding else ''
 
 
-def silent_fluoroscopes(state: ReconstructionState) -> Health | None:
-    """Warn if fluoroscopes have stopped, so that exposures no longer wait for them."""
+def _silent_fluoroscopes(state: ReconstructionState) -> str:
+    """Return a message if fluoroscopes have stopped, so that exposures do not wait for them."""
     silent = ', '.join(sorted(state.pairer.silent))
-    return warning(
+    return (
         silent and f'no frames of {silent}, points are reconstructed from the other fluoroscopes'
     )
 
 
-# Views were corrected with calibrations that match no known orientation.
-foreign_calibrations = counted(
-    'without_orientation',
-    '{count} exposures in the last minute were corrected with calibrations to which no '
-    'orientation of the rig belongs',
-)
-
-
-def distant_stamps(state: ReconstructionState) -> Health | None:
-    """Warn if frames of the same number are far apart in time, or stamps fit two exposures."""
+def _distant_stamps(state: ReconstructionState) -> str:
+    """Return a message if frames of a number are far apart, or stamps fit two exposures."""
     finding = state.pairer.tolerance.finding()
-    return warning(finding.sentence if finding else state.pairer.stamps.disagreement())
+    return finding.sentence if finding else state.pairer.stamps.disagreement()
 
 
-# Exposures lacked some of the views.
-incomplete_exposures = counted(
-    'incomplete', '{count} exposures without all fluoroscopes in the last minute'
-)
 STREAM_CONDITIONS = (
-    missing_publishers,
-    missed_rays,
-    silent_fluoroscopes,
-    foreign_calibrations,
-    refused_messages,
-    distant_stamps,
-    overrun_input,
-    unpaired_frames,
-    incomplete_exposures,
+    warns(_missing_publishers),
+    fails(_missed_rays),
+    warns(_silent_fluoroscopes),
+    counted(
+        'without_orientation',
+        '{count} exposures in the last minute were corrected with calibrations to which no '
+        'orientation of the rig belongs',
+    ),
+    conditions.refused_messages,
+    warns(_distant_stamps),
+    conditions.overrun_input,
+    conditions.unpaired_frames,
+    counted('incomplete', '{count} exposures without all fluoroscopes in the last minute'),
     healthy('reconstructing'),
 )
 CONDITIONS = (
-    lost_messages,
-    incompatible_publisher,
-    no_orientation,
-    inactive_node,
+    conditions.lost_messages,
+    conditions.incompatible_publisher,
+    warns(lambda s: '' if s.rigs.newest else s.refusals.last_fault or NO_ORIENTATION),
+    conditions.inactive_node,
     stalled_streams,
     *STREAM_CONDITIONS,
 )
@@ -302,7 +266,7 @@ class BodyState:
     state: BodiesState
     row: int
     untimed: int
-    untimed_recently: int
+    recent: Mapping[str, int]
 
     @property
     def status(self) -> PoseStatus:
@@ -316,57 +280,23 @@ class BodyState:
         return None if seen < 0 else (self.state.stamp_ns - seen) * 1e-9
 
 
-def exposures_without_time(state: BodyState) -> Health | None:
-    """Warn if exposures have the same stamp as the one before."""
-    count = state.untimed_recently
-    text = f'{count} exposures in the last minute have the stamp of the one before'
-    return warning(text if count else '')
-
-
-def unseen_body(state: BodyState) -> Health | None:
-    """Warn if no exposure has shown the body yet."""
-    return warning('' if state.unseen_s is not None else 'not seen yet')
-
-
-def lost_body(state: BodyState) -> Health | None:
-    """Warn if the body is lost."""
-    text = f'lost, its markers were last seen {state.unseen_s or 0:.1f} s ago'
-    return warning(text if state.status == PoseStatus.FAILED else '')
-
-
-def predicted_body(state: BodyState) -> Health | None:
-    """Warn if no marker is seen, so that the pose is predicted; the body is not lost yet."""
-    text = f'no marker is seen for {state.unseen_s or 0:.2f} s: the pose is predicted'
-    return warning(text if state.status == PoseStatus.FILLED else '')
-
-
-def ambiguous_body(state: BodyState) -> Health | None:
-    """Warn if the markers fit a second pose."""
-    text = 'its markers also fit in a second pose'
-    return warning(text if state.status == PoseStatus.AMBIGUOUS else '')
-
-
+# Messages about the last pose of a body that has been seen, by its status.
+POSE_MESSAGES = {
+    PoseStatus.FAILED: 'lost, its markers were last seen {0.unseen_s:.1f} s ago',
+    PoseStatus.FILLED: 'no marker is seen for {0.unseen_s:.2f} s: the pose is predicted',
+    PoseStatus.AMBIGUOUS: 'its markers also fit in a second pose',
+}
 BODY_CONDITIONS = (
-    exposures_without_time,
-    unseen_body,
-    lost_body,
-    predicted_body,
-    ambiguous_body,
+    counted('untimed', '{count} exposures in the last minute have the stamp of the one before'),
+    warns(lambda body: body.unseen_s is None and 'not seen yet'),
+    warns(lambda body: POSE_MESSAGES.get(body.status, '').format(body)),
     healthy('tracked'),
 )
-
-
-def failed_neutral(joint: JointTracker) -> Health | None:
-    """Warn if the neutral trial has ended without a neutral position."""
-    return warning('' if joint.error is None else f'no angles: {joint.error}')
-
-
-def awaited_neutral(joint: JointTracker) -> Health | None:
-    """Warn if the neutral trial has not ended."""
-    return warning('no angles before the end of the neutral trial' if joint.needs_neutral else '')
-
-
-JOINT_CONDITIONS = (failed_neutral, awaited_neutral, healthy('followed'))
+JOINT_CONDITIONS = (
+    warns(lambda joint: joint.error and f'no angles: {joint.error}'),
+    warns(lambda joint: joint.needs_neutral and 'no angles before the end of the neutral trial'),
+    healthy('followed'),
+)
 
 
 def statuses_of(follower: BodyFollower, counts: RecentCounts) -> list[Status]:
@@ -374,7 +304,7 @@ def statuses_of(follower: BodyFollower, counts: RecentCounts) -> list[Status]:
     state = follower.state
     if state is None:
         return []
-    untimed = follower.untimed, counts.growth('bodies', untimed=follower.untimed)['untimed']
+    untimed = follower.untimed, counts.growth('bodies', untimed=follower.untimed)
     bodies = [BodyState(body, state, row, *untimed) for row, body in enumerate(follower.bodies)]
     return [
         *(

@@ -19,17 +19,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from ..errors import DataError
 from ..io.bags.recording import Recording, RecordingOptions, TopicToRecord, lost_text
 from ..options import option
-from .runtime.diagnostics import (
-    DiagnosticsPublisher,
-    Health,
-    RateLimitedLogger,
-    StartError,
-    Status,
-    fault,
-    health_of,
-    healthy,
-    warning,
-)
+from .runtime.conditions import fails, health_of, healthy, warns
+from .runtime.diagnostics import DiagnosticsPublisher, RateLimitedLogger, StartError, Status
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.streams import FaultHandlers, StreamReader
@@ -71,22 +62,12 @@ class RecorderState(NamedTuple):
     overrun: str
 
 
-def failed_recording(state: RecorderState) -> Health | None:
-    """Report that nothing can be written any more."""
-    return fault(state.fault and (state.loss or state.fault))
-
-
-def dropped_messages(state: RecorderState) -> Health | None:
-    """Warn if messages were dropped."""
-    return warning(state.loss)
-
-
-def overrun_input(state: RecorderState) -> Health | None:
-    """Warn if messages were lost at the input, so that the recording has gaps."""
-    return warning(state.overrun)
-
-
-CONDITIONS = (failed_recording, dropped_messages, overrun_input, healthy('recording'))
+CONDITIONS = (
+    fails(lambda state: state.fault and (state.loss or state.fault)),
+    warns(lambda state: state.loss),
+    warns(lambda state: state.overrun),
+    healthy('recording'),
+)
 
 
 class RecorderNode(ParameterNode):

@@ -5,7 +5,7 @@
 
 import asyncio
 from collections import Counter
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import pytest
 from fluoro_calib_msgs.srv import Reset
@@ -16,6 +16,7 @@ from fluoro_calib_ros.exposures.stamps import StampTolerance
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.nodes import calibration_output, correcting_node, image_stream
 from fluoro_calib_ros.nodes import reconstruction_output as reconstruction
+from fluoro_calib_ros.nodes.runtime.conditions import fails, health_of, warns
 from fluoro_calib_ros.nodes.runtime.diagnostics import (
     ERROR,
     OK,
@@ -24,8 +25,6 @@ from fluoro_calib_ros.nodes.runtime.diagnostics import (
     RateLimitedLogger,
     RefusalLog,
     Refused,
-    fault,
-    health_of,
 )
 from fluoro_calib_ros.nodes.runtime.lifecycle import Stream, stream_faults
 from fluoro_calib_ros.nodes.runtime.services import Requests, ServiceEntry, create_services, within
@@ -54,7 +53,8 @@ def test_the_first_condition_that_holds_is_told_and_the_rest_is_not_asked():
     ]
     assert health_of(7, conditions) == (WARN, 'b')
     assert asked == [('a', 7), ('b', 7)]
-    assert fault('') is None and fault('x') == (ERROR, 'x')
+    assert fails(str)('') is None and fails(str)('x') == (ERROR, 'x')
+    assert warns(str)('') is None and warns(str)('x') == (WARN, 'x')
 
 
 @pytest.mark.parametrize(
@@ -75,13 +75,18 @@ def test_lost_messages_come_first_and_the_last_condition_always_holds(conditions
     assert conditions[-1](state).level == OK
 
 
-def reconstruction_state(stalled, **changes):
+def reconstruction_state(stalled, publishers=MappingProxyType({}), **changes):
     streams = {name: SimpleNamespace(stalled=lambda text=text: text) for name, text in stalled}
     values = {
-        'node': SimpleNamespace(readers=['active'], has_publisher=lambda topic: True),
+        'node': SimpleNamespace(
+            readers=['active'],
+            incompatible={},
+            has_publisher=lambda topic: True,
+            resolve_topic_name=lambda topic: f'/rig/{topic}',
+            get_publishers_info_by_topic=lambda topic: publishers.get(topic, ()),
+        ),
         'topics': tuple(f'{name}/corrected_observations' for name in streams),
         'refusals': refusals(),
-        'incompatible': {},
         'streams': streams,
         'rigs': SimpleNamespace(newest='a rig'),
         'pairer': SimpleNamespace(
@@ -125,6 +130,44 @@ def test_messages_lost_at_the_input_are_told_before_the_partners_that_they_leave
     recent = Counter(unpaired=3)
     found = health_of(reconstruction_state([('a', '')], recent=recent), reconstruction.CONDITIONS)
     assert found.level == WARN and found.message.startswith('3 frames without partner')
+
+
+def test_two_nodes_that_publish_a_stream_are_named_where_frames_have_no_partner():
+    nodes = [
+        SimpleNamespace(node_namespace='/rig', node_name=name) for name in ('correction', 'player')
+    ]
+    publishers = {'/rig/a/corrected_observations': nodes}
+    state = reconstruction_state([('a', '')], publishers, recent=Counter(unpaired=3))
+    assert health_of(state, reconstruction.CONDITIONS).message.endswith(
+        'in the last minute; 2 nodes publish a/corrected_observations (/rig/correction, '
+        '/rig/player)'
+    )
+    well = reconstruction_state([('a', '')], publishers)
+    assert health_of(well, reconstruction.CONDITIONS).level == OK
+
+
+def test_a_damaged_calibration_is_named_until_another_one_is_in_use():
+    stream = correcting_node.CorrectedStream('a', refusals())
+    node = SimpleNamespace(
+        item='frame',
+        incompatible={},
+        readers=['active'],
+        has_publisher=lambda topic: False,
+        prepared=lambda name: None,
+        resolve_topic_name=str,
+        get_publishers_info_by_topic=lambda topic: (),
+    )
+    state = correcting_node.CorrectingState(
+        node, ('a/target_observations',), stream.refusals, Counter(), stream, 'observations'
+    )
+    stream.refused_calibration = 'a.calibration.npz: this is no calibration file'
+    assert health_of(state, correcting_node.CONDITIONS) == (
+        WARN,
+        'no calibration yet: 0 frames were not corrected; a.calibration.npz: this is no '
+        'calibration file',
+    )
+    node.prepared = lambda name: 'calibration'
+    assert health_of(state, correcting_node.CONDITIONS).message == 'no publisher of observations'
 
 
 def test_faults_are_counted_in_the_stream_of_their_topic():

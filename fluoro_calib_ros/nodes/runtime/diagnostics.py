@@ -12,7 +12,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -277,8 +277,6 @@ OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 
-State = TypeVar('State')
-
 
 class Health(NamedTuple):
     """Level (OK, WARN or ERROR) and message of a Status."""
@@ -289,40 +287,6 @@ class Health(NamedTuple):
     def with_consequence(self, text: str) -> Health:
         """Return a copy with a consequence appended to the message."""
         return self._replace(message=f'{self.message}; {text}')
-
-
-def warning(message: str) -> Health | None:
-    """Return a WARN, or None for an empty message."""
-    return Health(WARN, message) if message else None
-
-
-def fault(message: str) -> Health | None:
-    """Return an ERROR, or None for an empty message."""
-    return Health(ERROR, message) if message else None
-
-
-def healthy(message: str) -> Callable[[Any], Health]:
-    """Return the condition that nothing is wrong, which always holds."""
-    return lambda state: Health(OK, message)
-
-
-def counted(name: str, text: str) -> Callable[[Any], Health | None]:
-    """Return a condition that warns of events within the last minute; text contains {count}."""
-    return lambda state: warning(
-        text.format(count=state.recent[name]) if state.recent[name] else ''
-    )
-
-
-# Returns the health of a state, None if the condition does not hold.
-Condition: TypeAlias = Callable[[State], Health | None]
-
-
-def health_of(state: State, conditions: Iterable[Condition[State]]) -> Health:
-    """Return the health from the first condition that holds: most severe first, OK last.
-
-    Later conditions are not evaluated.
-    """
-    return next(health for condition in conditions if (health := condition(state)) is not None)
 
 
 @dataclass(frozen=True)

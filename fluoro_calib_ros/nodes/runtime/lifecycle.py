@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import rclpy
@@ -21,7 +20,6 @@ from rclpy.qos import QoSProfile
 from .diagnostics import (
     USER_ERRORS,
     DiagnosticsPublisher,
-    Health,
     LatencyWindow,
     RateLimitedLogger,
     RecentCounts,
@@ -30,14 +28,11 @@ from .diagnostics import (
     StartError,
     Status,
     Trace,
-    counted,
-    fault,
     one_line,
-    warning,
 )
 from .parameters import ParameterNode
 from .streams import FaultHandlers, StreamReader
-from .topics import publisher_conflict, qos_overrides
+from .topics import qos_overrides
 
 T = TypeVar('T')
 Step = Callable[[], None]
@@ -154,6 +149,8 @@ class StreamNode(ManagedNode):
         self._resources = ExitStack()
         self._readiness = ''  # last logged state
         self.recent = RecentCounts()
+        #: messages about publishers that cannot be received, by topic; checked once a second
+        self.incompatible: dict[str, str] = {}
 
     def create_outputs(self) -> None:
         """Create what exists while the node is configured, by create_output() and own()."""
@@ -218,16 +215,6 @@ class StreamNode(ManagedNode):
         """Return whether a topic, named as in this node, has a publisher; remaps are applied."""
         return bool(self.count_publishers(self.resolve_topic_name(topic)))
 
-    def incompatible_publishers(self) -> dict[str, str]:
-        """Return a message for every topic with an incompatible publisher, and log them."""
-        messages: dict[str, str] = {}
-        for reader in self.readers:
-            reader.adapt()
-            messages.update(reader.incompatible_publishers())
-        for message in messages.values():
-            self.limited_logger.warning(message)
-        return messages
-
     def configure(self) -> None:
         """Create outputs, slow inputs and the diagnostics."""
         self.create_outputs()
@@ -235,6 +222,7 @@ class StreamNode(ManagedNode):
         self.own(diagnostics, diagnostics.close)
 
         def report() -> None:
+            self._check_publishers()
             diagnostics.publish(self.diagnose())
             self._log_readiness()
 
@@ -247,6 +235,15 @@ class StreamNode(ManagedNode):
         for reader in self.readers:
             reader.start()
         self._readiness = ''
+
+    def _check_publishers(self) -> None:
+        """Adapt the subscriptions to their publishers, and log those that are incompatible."""
+        self.incompatible = {}
+        for reader in self.readers:
+            reader.adapt()
+            self.incompatible.update(reader.incompatible_publishers())
+        for message in self.incompatible.values():
+            self.limited_logger.warning(message)
 
     def _log_readiness(self) -> None:
         """Log that the node is ready and which publishers it waits for, whenever that changes."""
@@ -278,7 +275,7 @@ class StreamNode(ManagedNode):
         self.reset()
 
 
-# Counts of the stream of one fluoroscope, and the conditions of its diagnostics.
+# Counts of the stream of one fluoroscope.
 
 
 class Stream:
@@ -328,73 +325,3 @@ def stream_faults(
         stream_of(topic).overrun += count
 
     return FaultHandlers(undecodable, lost, reader_error, too_large, overrun)
-
-
-@dataclass(frozen=True)
-class InputState:
-    """State from which the health of an input is diagnosed."""
-
-    node: StreamNode
-    topics: tuple[str, ...]  #: topics that the node subscribes to
-    refusals: RefusalLog
-    incompatible: Mapping[str, str]  #: messages about publishers that cannot be received, by topic
-    recent: Mapping[str, int]  #: counts within the last minute; see RecentCounts
-
-
-@dataclass(frozen=True)
-class StreamState(InputState):
-    """State from which the health of a stream is diagnosed; one of its topics suffices.
-
-    subject: what is published there, in words.
-    """
-
-    stream: Stream
-    subject: str
-
-
-def lost_messages(state: InputState) -> Health | None:
-    """Report that messages were lost by internal errors."""
-    return fault(state.refusals.failure())
-
-
-def incompatible_publisher(state: InputState) -> Health | None:
-    """Warn if a publisher offers less than is requested."""
-    return warning(next(filter(None, map(state.incompatible.get, state.topics)), ''))
-
-
-def inactive_node(state: InputState) -> Health | None:
-    """Warn if the node is not active and receives nothing."""
-    return warning('' if state.node.readers else 'the node is not active')
-
-
-def refused_messages(state: InputState) -> Health | None:
-    """Warn if messages were refused."""
-    return warning(state.refusals.refusal(state.recent['refused']))
-
-
-# Messages were lost before the node took them.
-overrun_input = counted(
-    'overrun',
-    '{count} messages lost at the input in the last minute: they come faster than they are taken, '
-    'and the queue was full',
-)
-# Other fluoroscopes did not see the same exposures.
-unpaired_frames = counted(
-    'unpaired', '{count} frames without partner of the other fluoroscopes in the last minute'
-)
-
-
-def several_nodes(state: StreamState) -> Health | None:
-    """Report that several calibration nodes serve the fluoroscope."""
-    return fault(publisher_conflict(state.node, f'{state.stream.name}/calibration_status'))
-
-
-def missing_publisher(state: StreamState) -> Health | None:
-    """Warn if nobody publishes the stream."""
-    has_publisher = any(map(state.node.has_publisher, state.topics))
-    return warning('' if has_publisher else f'no publisher of {state.subject}')
-
-
-def stalled_stream(state: StreamState) -> Health | None:
-    """Warn if the stream has stopped."""
-    return warning(state.stream.stalled())

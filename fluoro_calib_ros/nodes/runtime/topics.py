@@ -128,8 +128,8 @@ class TopicDiscovery:
             self._node.get_logger().warning(f'{name} is not {self._purpose}: {reason}')
 
 
-def publisher_conflict(node: Node, topic: str) -> str:
-    """Return a message if several nodes publish a topic that only one should, else ''.
+def several_publishers(node: Node, topic: str) -> str:
+    """Return a message if several nodes publish a topic, else ''.
 
     A killed node counts until DDS notices, within half a minute.
     """
@@ -141,10 +141,13 @@ def publisher_conflict(node: Node, topic: str) -> str:
         for p in publishers
         if 'UNKNOWN' not in p.node_name  # DDS announces the names of nodes later
     )
-    return (
-        f'{len(publishers)} nodes publish {topic} ({", ".join(names)}): no new calibration is '
-        'used until only one remains'
-    )
+    return f'{len(publishers)} nodes publish {topic} ({", ".join(names)})'
+
+
+def publisher_conflict(node: Node, topic: str) -> str:
+    """Return a message if several nodes publish a topic that only one should, else ''."""
+    text = several_publishers(node, topic)
+    return text and f'{text}: no new calibration is used until only one remains'
 
 
 ACKNOWLEDGED_S = 10.0  # time limit for readers to acknowledge the last messages

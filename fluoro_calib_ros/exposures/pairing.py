@@ -34,7 +34,7 @@ from .stamps import (
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # minimum number of views for an intersection
 PATIENCE = 32  # in frames: a stall of 32 ms at 1000 Hz
-REPEATS = 16  # number of newest frames of a stream that another publisher may repeat
+REPEATS = 32  # number of newest frames of a stream that another publisher may repeat
 UNLIMITED = 10**9  # frames
 
 # Frames by fluoroscope: dataclasses with the fields of PairableFrame.

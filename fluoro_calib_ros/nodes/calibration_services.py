@@ -287,7 +287,9 @@ class SelfCalibration(Job):
             self._use(outcome, result)
             if request.validate and not self._output.save_fault:
                 await self._write_report()
-        except (DataError, ValueError, OSError) as error:
+        except Cancelled:
+            raise
+        except Exception as error:  # also if the process was killed
             self._output.refused.update(dict.fromkeys(self.running, str(error)))
             raise
         finally:
@@ -303,8 +305,9 @@ class SelfCalibration(Job):
 
         Raises DataError and ValueError, also if the outcome could not be saved.
         """
-        check_output_folder(self._rig.directory, RESULT_FOLDER)
         job, rig = self._job_of(request)
+        self.running = tuple(job.frames)
+        check_output_folder(self._rig.directory, RESULT_FOLDER)
 
         def on_round(label: str, last: Round) -> None:
             self.last_round.update(dict.fromkeys(label.split('+'), last))
@@ -322,7 +325,6 @@ class SelfCalibration(Job):
                 raise_if_cancelled=lambda: self._raise_if_cancelled(is_cancel_requested()),
             )
 
-        self.running = tuple(job.frames)
         future, self._thread = in_thread(self._node, run)
         return future
 

@@ -15,23 +15,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rigs
+from fluoro_calib_msgs.srv import Calibrate
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.limits import CollectLimits
 from fluoro_calib_ros.nodes import calibration_input, calibration_services
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
-from fluoro_calib_ros.nodes.calibration_services import OrientationService
+from fluoro_calib_ros.nodes.calibration_services import OrientationService, SelfCalibration
+from fluoro_calib_ros.nodes.calibration_settings import CalibrationSettings, RigSetup
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     calibration_from_message,
     message_from_calibration,
 )
 from fluoro_calib_ros.nodes.messages.image import ImageConverter
 from fluoro_calib_ros.nodes.runtime.diagnostics import Refused, one_line
-from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path
+from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path, groups_of
 from fluoro_calib_ros.nodes.runtime.services import Requests
 
 SIZE = (64, 48)
@@ -336,6 +339,58 @@ def test_a_rig_that_is_not_calibrated_is_refused_before_the_capture():
     service, request = orientation_service(output)
     with pytest.raises(DataError, match='fluoroscope b is not calibrated yet'):
         service._orient(request).send(None)
+
+
+@pytest.mark.parametrize(
+    'end',
+    [
+        RuntimeError('the worker process ended with status -9'),
+        OSError('no space'),
+        calibration_services.Cancelled(),
+    ],
+)
+def test_a_calibration_that_ends_without_result_is_a_fault_unless_it_was_cancelled(
+    monkeypatch, tmp_path, end
+):
+    """Its process may have been killed, as by the kernel when the memory is full."""
+    output = SimpleNamespace(calibrations={}, refused={})
+    service = calibration_of(output, tmp_path / 'rig')
+
+    async def ended():
+        raise end
+
+    monkeypatch.setattr(calibration_services, 'in_thread', lambda *_: (ended(), None))
+    with pytest.raises(type(end)):
+        service._calibrate(Calibrate.Request(), None, print, lambda: False).send(None)
+    is_fault = not isinstance(end, calibration_services.Cancelled)
+    assert output.refused == (dict.fromkeys('ab', str(end)) if is_fault else {})
+    assert service.running == ()
+
+
+def test_a_folder_that_cannot_be_written_is_a_fault_of_the_fluoroscopes(tmp_path):
+    (tmp_path / 'file').write_text('')
+    output = SimpleNamespace(calibrations={}, refused={})
+    service = calibration_of(output, tmp_path / 'file' / 'rig')
+    with pytest.raises(DataError, match='is a file, not a folder'):
+        service._calibrate(Calibrate.Request(), None, print, lambda: False).send(None)
+    assert set(output.refused) == {'a', 'b'} and 'is a file' in output.refused['a']
+
+
+def calibration_of(output, directory):
+    """Return the service calibrate of a rig of a and b that saves in a folder."""
+    settings = CalibrationSettings(
+        **{name: group.options() for name, group in groups_of(CalibrationSettings).items()}
+    )
+    parts = orientation_service(output)[0]
+    parts = SimpleNamespace(
+        node=parts._node,
+        rig=RigSetup(('a', 'b'), rigs.rig().phantom, Names(), directory, lambda: settings),
+        exposures=SimpleNamespace(frames=lambda names=None: {'a': [], 'b': []}),
+        output=output,
+        files=None,
+        requests=Requests(),
+    )
+    return SelfCalibration(parts)
 
 
 @pytest.mark.parametrize(

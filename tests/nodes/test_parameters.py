@@ -208,6 +208,7 @@ class Settings(ParameterNode):
         SETTABLE.follow(self, self.used.append)
         ParameterGroup(Options, {'kind': 'kind'}).declare(self)
         self.declare_parameter('note', '')
+        self.declare_parameter('texts', ['x'])
 
 
 @pytest.fixture
@@ -251,6 +252,25 @@ def test_what_cannot_be_set_says_why_and_changes_nothing(settings, name, value, 
     done = settings.set_parameters_atomically([Parameter(name, value=value)])
     assert not done.successful and sentence in done.reason and '\n' not in done.reason
     assert settings.get_parameter(name).value == before and not settings.used
+
+
+def test_a_parameter_that_a_node_does_not_have_is_told_with_the_one_that_was_meant(settings):
+    mistyped, other = (
+        settings.set_parameters_atomically([Parameter(name, value=2.0)])
+        for name in ('lenght', '\n' + 'x' * 5000)
+    )
+    assert not mistyped.successful
+    assert mistyped.reason == 'there is no parameter lenght; did you mean length?'
+    assert not other.successful and other.reason.endswith('--help lists the parameters')
+    assert len(other.reason) < 900 and other.reason.isprintable()
+
+
+@pytest.mark.parametrize('kind', ['BYTE_ARRAY', 'BOOL_ARRAY', 'INTEGER_ARRAY', 'STRING_ARRAY'])
+def test_an_empty_list_has_no_type(settings, kind):
+    """Tools send [] as a list of any type, such as ros2 param set with one of booleans."""
+    done = settings.set_parameters_atomically([Parameter('texts', Parameter.Type[kind], [])])
+    assert done.successful, done.reason
+    assert settings.get_parameter('texts').value == []
 
 
 def test_text_of_a_parameter_is_as_long_as_its_limit(settings):

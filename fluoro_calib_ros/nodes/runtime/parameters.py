@@ -106,34 +106,36 @@ class ParameterNode(Node):
         self, parameter_list: Sequence[Parameter]
     ) -> SetParametersResult:
         """Set all parameters or none; integers are accepted for floating-point parameters."""
-        parameter_list = [self._as_declared(parameter) for parameter in parameter_list]
         for parameter in parameter_list:
-            name = parameter.name
-            is_declared = self.has_parameter(name)
-            if name == SIM_TIME or (is_declared and self.describe_parameter(name).read_only):
-                return SetParametersResult(
-                    successful=False,
-                    reason=f'parameter {name} is read when the node starts: set it in the '
-                    f'parameter file or with -p {name}:=VALUE, and start the node again',
-                )
-            text = str(parameter.value)
-            if len(text) > MAX_TEXT or not text.isprintable():
-                return SetParametersResult(
-                    successful=False,
-                    reason=f'parameter {printable(shortened(name))}: a value is printable text of '
-                    f'at most {MAX_TEXT} characters',
-                )
-        return super().set_parameters_atomically(parameter_list)
+            reason = self._refusal_of(parameter)
+            if reason:
+                return SetParametersResult(successful=False, reason=reason)
+        return super().set_parameters_atomically(list(map(self._as_declared, parameter_list)))
+
+    def _refusal_of(self, parameter: Parameter) -> str:
+        """Return why a parameter cannot be set to any value, or to one like this; else ''."""
+        name = parameter.name
+        if not self.has_parameter(name) and name != SIM_TIME:
+            return f'there is no parameter {printable(shortened(name))}{_hint(self, name)}'
+        if name == SIM_TIME or self.describe_parameter(name).read_only:
+            return (
+                f'parameter {name} is read when the node starts: set it in the parameter file or '
+                f'with -p {name}:=VALUE, and start the node again'
+            )
+        text = str(parameter.value)
+        if len(text) > MAX_TEXT or not text.isprintable():
+            return f'parameter {name}: a value is printable text of at most {MAX_TEXT} characters'
+        return ''
 
     def _as_declared(self, parameter: Parameter) -> Parameter:
-        """Convert an integer to a float if the parameter was declared as one."""
-        name = parameter.name
-        is_number = (
-            parameter.type_ == Parameter.Type.INTEGER
-            and self.has_parameter(name)
-            and self.get_parameter(name).type_ == Parameter.Type.DOUBLE
-        )
-        return Parameter(name, value=float(parameter.value)) if is_number else parameter
+        """Convert an integer to a float, and an empty list, to the type of the parameter."""
+        declared_type = self.get_parameter(parameter.name).type_
+        if parameter.type_ == Parameter.Type.INTEGER and declared_type == Parameter.Type.DOUBLE:
+            return Parameter(parameter.name, value=float(parameter.value))
+        is_empty_list = parameter.type_.name.endswith('_ARRAY') and not len(parameter.value)
+        if is_empty_list and declared_type == Parameter.Type.STRING_ARRAY:
+            return Parameter(parameter.name, declared_type, [])
+        return parameter
 
 
 @dataclass(frozen=True)
@@ -355,10 +357,14 @@ def unknown_parameters(node: Node) -> list[str]:
         rig_parameters = _parameters_of_rig() if rig_parameters is None else rig_parameters
         if name in rig_parameters:
             continue
-        matches = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
-        hint = f'; did you mean {matches[0]}?' if matches else '; --help lists the parameters'
-        sentences.append(f'there is no parameter {name}, it has no effect{hint}')
+        sentences.append(f'there is no parameter {name}, it has no effect{_hint(node, name)}')
     return sentences
+
+
+def _hint(node: Node, name: str) -> str:
+    """Return which parameter was probably meant by a name that a node does not have."""
+    matches = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
+    return f'; did you mean {matches[0]}?' if matches else '; --help lists the parameters'
 
 
 def _parameters_of_rig() -> frozenset[str]:

@@ -20,22 +20,22 @@ from .runtime import conditions
 from .runtime.conditions import StreamState, health_of, healthy, state_of, warns
 from .runtime.diagnostics import WARN, Health, RefusalLog, Status, one_line
 from .runtime.lifecycle import Stream, StreamNode, stream_faults
-from .runtime.parameters import CalibratedParameters, expand_path
+from .runtime.parameters import ParameterGroup, declare_read_limits, expand_path
 from .runtime.streams import FaultHandlers
 
 FILES = f'*{SUFFIX}'
+ANGLES = ParameterGroup(AngleOptions)
 
 
+@dataclass
 class CorrectedStream(Stream):
     """Stream of a fluoroscope whose messages are corrected."""
 
-    def __init__(self, name: str, refusals: RefusalLog) -> None:
-        super().__init__(name, refusals)
-        self.corrected = 0  #: number of corrected frames or images
-        self.waiting = 0  #: number that came before the first calibration
-        self.refused_calibration = ''  #: why the last one was refused; '' if none was
-        #: angle [rad] since the last diagnostics that is far from all calibrated angles
-        self.beyond: tuple[float, AngleField] | None = None
+    corrected: int = 0  #: number of corrected frames or images
+    waiting: int = 0  #: number that came before the first calibration
+    refused_calibration: str = ''  #: why the last one was refused; '' if none was
+    #: angle [rad] since the last diagnostics that is far from all calibrated angles
+    beyond: tuple[float, AngleField] | None = None
 
     def count_corrected(self, info: Mapping[str, int]) -> None:
         """Count a message that was corrected and published; info: see StreamReader.subscribe."""
@@ -94,7 +94,7 @@ class CorrectingNode(StreamNode):
     Nothing is corrected before the first calibration. A correction that depends on the angle of a
     C-arm is evaluated at the angle at the stamp, or averaged over the angles if that is unknown.
     Subclasses set the class attributes and override prepare(), on_calibration_ready(),
-    make_stream(), make_angles() and extra_values().
+    make_angles() and extra_values().
     """
 
     item: ClassVar[str] = ''  #: corrected item: frame or image
@@ -102,31 +102,18 @@ class CorrectingNode(StreamNode):
     refusal_kinds: ClassVar[tuple[str, ...]] = ()
     #: what becomes of the items at an angle far from all calibrated ones
     beyond: ClassVar[str] = ''
+    stream_kind: ClassVar[type[CorrectedStream]] = CorrectedStream
     topics: tuple[str, ...] = ()  #: subscribed topics, relative to each fluoroscope
+    parameters: ClassVar[ParameterGroup[Any]]  #: group of CalibratedParameters
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.names: tuple[str, ...] = ()
-        self._directory = ''
-        self.streams: dict[str, Any] = {}
-        self.angle_options = AngleOptions()
-        self.angles: dict[str, AngleInput] = {}  #: angles of the C-arms, by fluoroscope
-
-    def use_parameters(self, parameters: CalibratedParameters, angles: AngleOptions) -> None:
-        """Apply the parameters common to these nodes; subclasses call this in __init__."""
-        self.angle_options = angles
-        self.autostart = parameters.autostart
-        self._directory = parameters.calibration_directory
-        self.names = parameters.fluoroscopes
+        declare_read_limits(self)
+        self.settings = self.parameters.declare(self)
+        self.angle_options = ANGLES.declare(self)
+        self.autostart = self.settings.autostart
+        self.names: tuple[str, ...] = self.settings.fluoroscopes
         self.reset()
-
-    def make_stream(self, name: str) -> CorrectedStream:
-        """Return the initial stream state of a fluoroscope."""
-        return CorrectedStream(name, self.refusal_log())
-
-    def refusal_log(self) -> RefusalLog:
-        """Return a log that counts the refused messages of a stream."""
-        return RefusalLog(self.item, self.limited_logger)
 
     def make_angles(self) -> dict[str, AngleInput]:
         """Return the AngleInput of each fluoroscope; threads must not share one."""
@@ -156,7 +143,10 @@ class CorrectingNode(StreamNode):
 
     def reset(self) -> None:
         """Reset all counters."""
-        self.streams = {name: self.make_stream(name) for name in self.names}
+        self.streams: dict[str, Any] = {
+            name: self.stream_kind(name, RefusalLog(self.item, self.limited_logger))
+            for name in self.names
+        }
         self.angles = self.make_angles()
 
     def prepared(self, name: str) -> Any:
@@ -169,8 +159,8 @@ class CorrectingNode(StreamNode):
             self, self.names, self.prepare, self.on_calibration_ready, self._on_refused_calibration
         )
         self.own(self._calibrations, self._calibrations.close)
-        if self._directory:
-            self._load_calibrations(self._directory)
+        if self.settings.calibration_directory:
+            self._load_calibrations(self.settings.calibration_directory)
 
     def _load_calibrations(self, text: str) -> None:
         """Start with the calibrations of a folder, which may be empty or missing at first."""

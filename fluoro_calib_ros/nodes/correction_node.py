@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,10 +18,9 @@ from sensor_msgs.msg import CameraInfo
 
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..exposures.angles import AngleOptions
 from ..exposures.stamps import nanoseconds_from_stamp
 from ..limits import StreamLimits
-from .correcting_node import CorrectedStream, CorrectingNode
+from .correcting_node import ANGLES, CorrectedStream, CorrectingNode
 from .frame_validation import OBSERVED_REFUSALS, FrameValidator, with_limit
 from .messages.fluoroscope_calibration import message_of_corrected_stream
 from .messages.observations import (
@@ -28,32 +28,27 @@ from .messages.observations import (
     decode_target_observations,
     encode_corrected_observations,
 )
-from .runtime.diagnostics import RefusalLog, Refused
+from .runtime.diagnostics import Refused
 from .runtime.main import run
-from .runtime.parameters import (
-    READ_LIMITS,
-    CalibratedParameters,
-    ParameterGroup,
-    declare_read_limits,
-)
+from .runtime.parameters import READ_LIMITS, CalibratedParameters, ParameterGroup
 from .runtime.topics import latched_qos, observations_qos
 
 # As int, because comparing an array with an enum member takes longer than all other work here.
 INVALID = int(CorrectionStatus.INVALID)
 _NODE = ParameterGroup(CalibratedParameters)
-_ANGLES = ParameterGroup(AngleOptions)
 _LIMITS = ParameterGroup(StreamLimits)
-PARAMETERS = (_NODE, _ANGLES, _LIMITS, READ_LIMITS)
+PARAMETERS = (_NODE, ANGLES, _LIMITS, READ_LIMITS)
 
 
+@dataclass
 class ObservationStream(CorrectedStream):
     """Stream of image points to correct."""
 
-    def __init__(self, name: str, refusals: RefusalLog) -> None:
-        super().__init__(name, refusals)
-        self.validator = FrameValidator(name)
-        self.invalid_points = 0
-        self.stamp: tuple[int, int] | None = None  # seconds and nanoseconds of the newest frame
+    invalid_points: int = 0
+    stamp: tuple[int, int] | None = None  #: seconds and nanoseconds of the newest frame
+
+    def __post_init__(self) -> None:
+        self.validator = FrameValidator(self.name)
 
 
 class CorrectionNode(CorrectingNode):
@@ -63,17 +58,13 @@ class CorrectionNode(CorrectingNode):
     subject = 'target observations'
     refusal_kinds = OBSERVED_REFUSALS
     beyond = 'the points are OUTSIDE'
+    stream_kind = ObservationStream
     topics = ('target_observations',)
+    parameters = _NODE
 
     def __init__(self) -> None:
         super().__init__('correction_node')
-        declare_read_limits(self)
         self._limits = _LIMITS.declare(self)
-        self.use_parameters(_NODE.declare(self), _ANGLES.declare(self))
-
-    def make_stream(self, name: str) -> ObservationStream:
-        """Return the initial stream state of a fluoroscope."""
-        return ObservationStream(name, self.refusal_log())
 
     def create_outputs(self) -> None:
         """Create the outputs and subscribe to calibrations."""

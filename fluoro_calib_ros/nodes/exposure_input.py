@@ -44,14 +44,13 @@ def _no_angle() -> None:
     """Return None: the angle is unknown."""
 
 
+@dataclass
 class PhantomStream(Stream):
     """Stream of a fluoroscope that is searched for the phantom."""
 
-    def __init__(self, name: str, refusals: RefusalLog) -> None:
-        super().__init__(name, refusals)
-        self.image_size: tuple[int, int] | None = None
-        self.other_targets: bytes | None = None  # ids in the last frame without the phantom
-        self.is_other_object_logged = False
+    image_size: tuple[int, int] | None = None
+    other_targets: bytes | None = None  #: ids in the last frame without the phantom
+    is_other_object_logged: bool = False
 
 
 RADIOGRAPH = 'radiograph'

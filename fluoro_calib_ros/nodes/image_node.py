@@ -18,13 +18,12 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..exposures.angles import AngleOptions
 from ..exposures.stamps import nanoseconds_from_stamp
 from ..images.angle_maps import AngleMaps
 from ..images.corrector import INTERPOLATIONS
 from ..options import option
 from .angle_input import AngleInput
-from .correcting_node import CorrectedStream, CorrectingNode
+from .correcting_node import ANGLES, CorrectedStream, CorrectingNode
 from .messages.fluoroscope_calibration import message_of_corrected_stream
 from .messages.image import (
     COMPRESSIONS,
@@ -33,14 +32,9 @@ from .messages.image import (
     compressed_message,
     use_single_thread,
 )
-from .runtime.diagnostics import RefusalLog, Refused
+from .runtime.diagnostics import Refused
 from .runtime.main import run
-from .runtime.parameters import (
-    READ_LIMITS,
-    CalibratedParameters,
-    ParameterGroup,
-    declare_read_limits,
-)
+from .runtime.parameters import READ_LIMITS, CalibratedParameters, ParameterGroup
 from .runtime.topics import images_qos, latched_qos
 
 RAW = (Image, 'image_raw')
@@ -72,8 +66,7 @@ class ImageParameters(CalibratedParameters):
 
 
 _NODE = ParameterGroup(ImageParameters, settable=('compressed_format', 'jpeg_quality'))
-_ANGLES = ParameterGroup(AngleOptions)
-PARAMETERS = (_NODE, _ANGLES, READ_LIMITS)
+PARAMETERS = (_NODE, ANGLES, READ_LIMITS)
 
 
 class _PreparedCalibration:
@@ -87,13 +80,14 @@ class _PreparedCalibration:
         self.info = message_of_corrected_stream(calibration, Time())
 
 
+@dataclass
 class CorrectedImages(CorrectedStream):
     """Stream of images to correct."""
 
-    def __init__(self, name: str, refusals: RefusalLog) -> None:
-        super().__init__(name, refusals)
-        self.converter = ImageConverter(name)
-        self.compressed = 0
+    compressed: int = 0
+
+    def __post_init__(self) -> None:
+        self.converter = ImageConverter(self.name)
 
 
 class ImageNode(CorrectingNode):
@@ -103,23 +97,18 @@ class ImageNode(CorrectingNode):
     subject = 'images'
     refusal_kinds = IMAGE_REFUSALS
     beyond = 'the correction of the images is extrapolated'
+    stream_kind = CorrectedImages
+    parameters = _NODE
 
     def __init__(self) -> None:
         super().__init__('image_node')
-        declare_read_limits(self)
-        self._settings = _NODE.declare(self)
-        self._inputs = INPUTS[self._settings.inputs]
+        self._inputs = INPUTS[self.settings.inputs]
         self.topics = tuple(topic for _, topic in self._inputs)
-        self.use_parameters(self._settings, _ANGLES.declare(self))
         _NODE.follow(self, self._use_settings)
         use_single_thread()
 
     def _use_settings(self, settings: ImageParameters) -> None:
-        self._settings = settings
-
-    def make_stream(self, name: str) -> CorrectedImages:
-        """Return the initial stream state of a fluoroscope."""
-        return CorrectedImages(name, self.refusal_log())
+        self.settings = settings
 
     def make_angles(self) -> dict[str, AngleInput]:
         """Return an AngleInput for each fluoroscope, as each has its own thread."""
@@ -154,7 +143,7 @@ class ImageNode(CorrectingNode):
 
     def prepare(self, calibration: FluoroscopeCalibration) -> _PreparedCalibration:
         """Return the calibration with its pixel maps."""
-        return _PreparedCalibration(calibration, self._settings.interpolation)
+        return _PreparedCalibration(calibration, self.settings.interpolation)
 
     def on_calibration_ready(self, name: str, prepared: _PreparedCalibration) -> None:
         """Log that a calibration is in use."""
@@ -203,8 +192,8 @@ class ImageNode(CorrectingNode):
                 compressed_message(
                     corrected,
                     pixels,
-                    self._settings.compressed_format,
-                    self._settings.jpeg_quality,
+                    self.settings.compressed_format,
+                    self.settings.jpeg_quality,
                 )
             )
             stream.compressed += 1

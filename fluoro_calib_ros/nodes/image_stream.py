@@ -9,7 +9,7 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -22,31 +22,30 @@ from .angle_input import AngleInput
 from .messages.image import IMAGE_REFUSALS, ImageConverter
 from .runtime import conditions
 from .runtime.conditions import StreamState, healthy, warns
-from .runtime.diagnostics import Health, RefusalLog, Refused
+from .runtime.diagnostics import Health, Refused
 from .runtime.lifecycle import Stream
 from .runtime.streams import REMEMBERED
 
 
+@dataclass
 class ImageStream(Stream):
     """Stream of images from which targets are extracted."""
 
-    def __init__(self, name: str, refusals: RefusalLog, topic: str) -> None:
-        super().__init__(name, refusals)
-        self.topic = topic  #: one of the topics of the images, for messages
-        #: number of images with observations, of those among them followed from the previous
-        #: image, of images without observations, and of images that were shed unprocessed
-        self.extracted = 0
-        self.followed = 0
-        self.without = 0
-        self.shed = 0
-        self.headers: OrderedDict[int, Header] = OrderedDict()  #: of the last images, by number
-        self.retracted = 0  #: number of published ids that were retracted
-        self.last: Observations | None = None  #: observations in the last image
-        self.converter = ImageConverter(name)
-        self.seconds = 0.0  #: total processing time of the images
-        #: rate, and number of images shed, between the last two calls of measure()
-        self.rate_hz = 0.0
-        self.shed_now = 0
+    topic: str = ''  #: one of the topics of the images, for messages
+    extracted: int = 0  #: number of images with observations
+    followed: int = 0  #: number of those among them that were followed from the previous image
+    without: int = 0  #: number of images without observations
+    shed: int = 0  #: number of images that were shed unprocessed
+    headers: OrderedDict[int, Header] = field(default_factory=OrderedDict)  #: last, by number
+    retracted: int = 0  #: number of published ids that were retracted
+    last: Observations | None = None  #: observations in the last image
+    seconds: float = 0.0  #: total processing time of the images
+    #: rate, and number of images shed, between the last two calls of measure()
+    rate_hz: float = 0.0
+    shed_now: int = 0
+
+    def __post_init__(self) -> None:
+        self.converter = ImageConverter(self.name)
         self._first: tuple[tuple[int, int], str] | None = None  # image size and frame id
         # At the last measurement: time, number of processed images, number of shed images.
         self._before = (time.monotonic(), 0, 0)

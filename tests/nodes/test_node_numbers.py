@@ -474,7 +474,7 @@ def test_points_are_counted_by_status():
 
 
 def test_stream_of_images_measures_its_rate_and_what_was_shed():
-    stream = ImageStream('a', refusals(), 'a/image_raw')
+    stream = ImageStream('a', refusals(), topic='a/image_raw')
     found = Fake(reason='', followed=True, note='', seconds=0.25)
     for each in (found, found, Fake(reason='dark', followed=False, note='', seconds=0.5)):
         stream.count(Image(), each)
@@ -489,7 +489,7 @@ def test_stream_of_images_measures_its_rate_and_what_was_shed():
 
 
 def test_image_of_another_size_or_frame_is_refused():
-    stream = ImageStream('a', refusals(), 'a/image_raw')
+    stream = ImageStream('a', refusals(), topic='a/image_raw')
     shape = {'now': (4, 6)}
     stream.converter = Fake(
         decoded=lambda message: (np.zeros(shape['now']), 'mono8'),

@@ -143,6 +143,11 @@ class RefusalLog:
         self._last_failure = ''
 
     @property
+    def limit(self) -> str:
+        """Parameter that limits the size of a message."""
+        return _LIMITS[self._item]
+
+    @property
     def total(self) -> int:
         """Number of refused messages."""
         return self.counts.total()
@@ -152,27 +157,6 @@ class RefusalLog:
         self.counts[getattr(error, 'kind', 'invalid')] += 1
         self.last_fault = str(error)
         self._logger.warning(f'{self._item} refused: {error}')
-
-    def refuse_undecodable(self, topic: str) -> None:
-        """Count a message that cannot be decoded, on the topic <fluoroscope>/<...>."""
-        fluoroscope = topic.partition('/')[0]
-        self.refuse(
-            Refused(
-                'undecodable',
-                f'fluoroscope {fluoroscope}: a message on {topic} cannot be decoded',
-            )
-        )
-
-    def refuse_too_large(self, topic: str, size: int) -> None:
-        """Count a message of too many bytes (size) on the topic <fluoroscope>/<...>."""
-        fluoroscope = topic.partition('/')[0]
-        self.refuse(
-            Refused(
-                TOO_LARGE,
-                f'fluoroscope {fluoroscope}: a message on {topic} has {size} bytes, more than '
-                f'the parameter {_LIMITS[self._item]} allows',
-            )
-        )
 
     def note(self, text: str) -> None:
         """Log a fault that does not lead to a refusal."""

@@ -9,6 +9,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import rclpy
@@ -18,12 +19,14 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from .diagnostics import (
+    TOO_LARGE,
     USER_ERRORS,
     DiagnosticsPublisher,
     LatencyWindow,
     RateLimitedLogger,
     RecentCounts,
     RefusalLog,
+    Refused,
     StallDetector,
     StartError,
     Status,
@@ -278,18 +281,17 @@ class StreamNode(ManagedNode):
 # Counts of the stream of one fluoroscope.
 
 
+@dataclass
 class Stream:
     """Counts of the messages of one fluoroscope; nodes add their own counts."""
 
-    def __init__(self, name: str, refusals: RefusalLog) -> None:
-        self.name = name  #: fluoroscope
-        self.received = 0  #: number of messages
-        #: number of messages lost at the input, because the queue was full
-        self.overrun = 0
-        self.refusals = refusals  #: shared by streams whose messages are counted together
-        self.stall = StallDetector()
-        #: delays from the arrival of a message to the publication of its result
-        self.latencies = LatencyWindow()
+    name: str  #: fluoroscope
+    refusals: RefusalLog  #: shared by streams whose messages are counted together
+    received: int = 0  #: number of messages
+    overrun: int = 0  #: number of messages lost at the input, because the queue was full
+    stall: StallDetector = field(default_factory=StallDetector)
+    #: delays from the arrival of a message to the publication of its result
+    latencies: LatencyWindow = field(default_factory=LatencyWindow)
 
     def add_latency(self, received_ns: int) -> None:
         """Add the time since the arrival of a message [ns, system clock]."""
@@ -308,18 +310,22 @@ def stream_faults(
     def stream_of(topic: str) -> Stream:
         return streams[topic.partition('/')[0]]
 
-    def undecodable(topic: str) -> None:
+    def refuse(topic: str, kind: str, reason: str) -> None:
         stream = stream_of(topic)
         stream.received += 1
-        stream.refusals.refuse_undecodable(topic)
+        stream.refusals.refuse(
+            Refused(kind, f'fluoroscope {stream.name}: a message on {topic} {reason}')
+        )
+
+    def undecodable(topic: str) -> None:
+        refuse(topic, 'undecodable', 'cannot be decoded')
 
     def lost(topic: str, error: Exception) -> None:
         stream_of(topic).refusals.fail(topic, error)
 
     def too_large(topic: str, size: int) -> None:
-        stream = stream_of(topic)
-        stream.received += 1
-        stream.refusals.refuse_too_large(topic, size)
+        limit = stream_of(topic).refusals.limit
+        refuse(topic, TOO_LARGE, f'has {size} bytes, more than the parameter {limit} allows')
 
     def overrun(topic: str, count: int) -> None:
         stream_of(topic).overrun += count

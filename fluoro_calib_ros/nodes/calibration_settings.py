@@ -46,6 +46,7 @@ from .runtime.parameters import (
     READ_LIMITS,
     ManagedParameters,
     ParameterNode,
+    check_frame,
     expand_path,
     group,
     groups_of,
@@ -116,6 +117,10 @@ class CalibrationParameters(ManagedParameters):
     heal_accept: bool = option(
         False, 'whether a healed rig with the verdict pass is used without accept_healing'
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_frame(self.rig_frame)
 
 
 _OF_REQUESTS = ('model', 'interior', 'loss', 'max_iterations', 'relative_orientation', 'datum')

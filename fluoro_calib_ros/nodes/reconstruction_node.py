@@ -48,6 +48,7 @@ from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
     CalibratedParameters,
+    check_frame,
     declare_groups,
     declare_read_limits,
     follow_groups,
@@ -87,6 +88,10 @@ class ReconstructionParameters(CalibratedParameters):
     )
 
     min_fluoroscopes = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_frame(self.rig_frame)
 
 
 @dataclass(frozen=True)

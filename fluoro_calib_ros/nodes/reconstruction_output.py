@@ -9,14 +9,14 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from fluoro_calib_msgs.msg import BodyPoses, JointAngles, ReconstructedPoints
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState, PointCloud2
+from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
@@ -25,22 +25,19 @@ from ..exposures.pairing import Pairer
 from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, IntersectedPoints
 from .messages.bodies import (
+    BODY_FORMS,
     FORMS,
     BodiesContent,
     joint_state,
     message_from_bodies,
     message_from_joints,
-    odometry,
-    pose_with_covariance,
     transforms_of_bodies,
 )
 from .messages.points import (
-    MOCAP_MARKERS,
+    POINT_FORMS,
     PointsContent,
     ellipsoid_markers,
     encode_reconstructed_points,
-    mocap_markers,
-    point_cloud,
 )
 from .retractions import BodyRetractions
 from .rig_input import BodiesState, BodyFollower, RigInput
@@ -56,7 +53,6 @@ COUNTED_STATUSES = {
     'failed': FAILED,
     'in a single view': SINGLE_VIEW,
 }
-POINT_FORMS = ('points', 'markers', 'mocap_markers')  # in addition to the points with covariance
 
 
 class PointsCounter:
@@ -84,18 +80,13 @@ class PointsOutput:
     """Publishers of reconstructed points."""
 
     def __init__(self, node: StreamNode) -> None:
-        kinds = {
-            'points_with_covariance': ReconstructedPoints,
-            'points': PointCloud2,
-            'markers': MarkerArray,
-        }
-        if MOCAP_MARKERS is not None:
-            kinds['mocap_markers'] = MOCAP_MARKERS
-        self._outputs = {
-            name: node.create_output(kind, f'reconstruction/{name}', observations_qos())
-            for name, kind in kinds.items()
-        }
-        self._markers_published_ns = 0
+        def output(kind: type, name: str) -> Publisher:
+            return node.create_output(kind, f'reconstruction/{name}', observations_qos())
+
+        self._points = output(ReconstructedPoints, 'points_with_covariance')
+        self._ellipsoids = output(MarkerArray, 'markers')
+        self._forms = [(output(kind, name), make) for name, (kind, make) in POINT_FORMS.items()]
+        self._ellipsoids_published_ns = 0
 
     def publish(self, content: PointsContent, sigmas: float, rate_hz: float) -> None:
         """Publish points with their covariance, then the other forms that have subscribers.
@@ -103,24 +94,19 @@ class PointsOutput:
         sigmas: half axes of the ellipsoids. rate_hz: largest rate of the ellipsoids.
         """
         data = encode_reconstructed_points(content)
-        self._outputs['points_with_covariance'].publish(data)
-        subscribed = [
-            name
-            for name in POINT_FORMS
-            if name in self._outputs and self._outputs[name].get_subscription_count()
-        ]
-        if not subscribed:
+        self._points.publish(data)
+        forms = [form for form in self._forms if form[0].get_subscription_count()]
+        now = time.monotonic_ns()
+        is_due = now - self._ellipsoids_published_ns >= round(1e9 / rate_hz)
+        if is_due and self._ellipsoids.get_subscription_count():
+            self._ellipsoids_published_ns = now
+            forms.append((self._ellipsoids, partial(ellipsoid_markers, sigmas=sigmas)))
+        if not forms:
             return
         message = deserialize_message(data, ReconstructedPoints)
         good = np.flatnonzero(content.points.status <= OUTSIDE)
-        if 'points' in subscribed:
-            self._outputs['points'].publish(point_cloud(message, good))
-        if 'mocap_markers' in subscribed:
-            self._outputs['mocap_markers'].publish(mocap_markers(message, good))
-        now = time.monotonic_ns()
-        if 'markers' in subscribed and now - self._markers_published_ns >= round(1e9 / rate_hz):
-            self._markers_published_ns = now
-            self._outputs['markers'].publish(ellipsoid_markers(message, good, sigmas))
+        for publisher, make in forms:
+            publisher.publish(make(message, good))
 
 
 class BodiesOutput:
@@ -135,37 +121,34 @@ class BodiesOutput:
         def output(kind: type, topic: str) -> Publisher:
             return node.create_output(kind, topic, observations_qos())
 
-        self._rig_frame = rig_frame
         self._bodies = output(BodyPoses, 'reconstruction/body_poses')
-        self._transforms = output(TFMessage, '/tf')
-        prefixes = [f'reconstruction/bodies/{name}' for name in names]
-        self._poses = [output(PoseWithCovarianceStamped, f'{prefix}/pose') for prefix in prefixes]
-        self._odometry = [output(Odometry, f'{prefix}/odometry') for prefix in prefixes]
-        self._forms = [
-            (output(kind, f'reconstruction/{name}'), make) for name, (kind, make) in FORMS.items()
-        ]
         self._joints = output(JointAngles, 'reconstruction/joint_angles') if has_joints else None
-        self._joint_states = (
-            output(JointState, 'reconstruction/joint_states') if has_joints else None
-        )
+        forms: dict[str, tuple[type, Any]] = {
+            '/tf': (TFMessage, partial(transforms_of_bodies, parent=rig_frame)),
+            **{f'reconstruction/{name}': form for name, form in FORMS.items()},
+        }
+        if has_joints:
+            forms['reconstruction/joint_states'] = JointState, joint_state
+        self._forms = [(output(kind, topic), make) for topic, (kind, make) in forms.items()]
+        self._forms_of_bodies = [
+            [
+                (output(kind, f'reconstruction/bodies/{name}/{form}'), make)
+                for form, (kind, make) in BODY_FORMS.items()
+            ]
+            for name in names
+        ]
         self.retractions = BodyRetractions(self.publish_own)  #: of the published poses
 
     def publish(self, content: BodiesContent) -> None:
         """Publish an exposure; standard message types only while they have subscribers."""
         message = self.publish_own(content)
-        if self._transforms.get_subscription_count():
-            transforms = transforms_of_bodies(content, message, self._rig_frame)
-            self._transforms.publish(transforms)
-        for row in content.measured:
-            if self._poses[row].get_subscription_count():
-                self._poses[row].publish(pose_with_covariance(message, row))
-            if self._odometry[row].get_subscription_count():
-                self._odometry[row].publish(odometry(content, message, row))
         for publisher, make in self._forms:
             if publisher.get_subscription_count():
                 publisher.publish(make(content, message))
-        if self._joint_states is not None and self._joint_states.get_subscription_count():
-            self._joint_states.publish(joint_state(content))
+        for row in content.measured:
+            for publisher, make in self._forms_of_bodies[row]:
+                if publisher.get_subscription_count():
+                    publisher.publish(make(content, message, row))
         self.retractions.note(content)
 
     def publish_own(self, content: BodiesContent) -> BodyPoses:

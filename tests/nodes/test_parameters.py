@@ -17,6 +17,8 @@ from rclpy.parameter import Parameter
 
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.limits import MAX_TEXT
+from fluoro_calib_ros.nodes.calibration_settings import CalibrationParameters
+from fluoro_calib_ros.nodes.reconstruction_node import ReconstructionParameters
 from fluoro_calib_ros.nodes.runtime.diagnostics import StartError
 from fluoro_calib_ros.nodes.runtime.parameters import (
     MAX_INTEGER,
@@ -171,6 +173,17 @@ def test_a_group_becomes_an_options_object(make_node):
 def test_invalid_values_name_the_parameter(make_node, values, sentence):
     with pytest.raises(StartError, match=f'^{sentence}'):
         GROUP.declare(make_node(**values))
+
+
+@pytest.mark.parametrize('kind', [CalibrationParameters, ReconstructionParameters])
+@pytest.mark.parametrize('name, is_valid', [('', 0), ('/lab', 0), ('lab', 1), ('site/lab 2', 1)])
+def test_rig_frame_is_a_name_that_tf2_accepts(make_node, kind, name, is_valid):
+    group = ParameterGroup(kind)
+    if is_valid:
+        assert group.declare(make_node(rig_frame=name)).rig_frame == name
+        return
+    with pytest.raises(StartError, match=f'^parameter rig_frame: {name!r} is no name of a frame'):
+        group.declare(make_node(rig_frame=name))
 
 
 def test_shipped_rviz_and_aggregator_configurations_name_our_topics_and_nodes():

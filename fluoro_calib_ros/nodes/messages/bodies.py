@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from fluoro_calib_msgs.msg import BodyPoses, JointAngles
-from geometry_msgs.msg import Point, Pose, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
@@ -29,6 +29,7 @@ from ...photogrammetry.rig_orientation import RigOrientation
 from ...photogrammetry.rotations import quaternion_from_matrix
 from .observations import float64_field, stamp_from_nanoseconds, uint8_field, uint32_field
 from .points import GREEN, LIFETIME_NS, YELLOW
+from .rig_orientation import pose_of, transform_of
 
 try:
     from mocap4r2_msgs import msg as mocap
@@ -64,11 +65,10 @@ class BodiesContent(NamedTuple):
     joints: Sequence[JointMotion]  #: of this exposure
     used: Sequence[NDArray[np.int64]]  #: ids of the markers used for each pose
 
-    def header(self, frame_id: str = '') -> Header:
-        """Return the header; by default, its frame is that of the orientation."""
+    def header(self) -> Header:
+        """Return the header, with the frame of the orientation."""
         return Header(
-            stamp=stamp_from_nanoseconds(self.stamp_ns),
-            frame_id=frame_id or self.orientation.frame_id,
+            stamp=stamp_from_nanoseconds(self.stamp_ns), frame_id=self.orientation.frame_id
         )
 
     @property
@@ -96,16 +96,6 @@ def message_from_bodies(content: BodiesContent) -> BodyPoses:
     return message
 
 
-def pose_of(message: BodyPoses, row: int) -> Pose:
-    """Return the pose of a body from a message."""
-    pose = Pose()
-    for name in 'xyz':
-        setattr(pose.position, name, getattr(message, name)[row])
-    for name in 'xyzw':
-        setattr(pose.orientation, name, getattr(message, f'q{name}')[row])
-    return pose
-
-
 def pose_with_covariance(message: BodyPoses, row: int) -> PoseWithCovarianceStamped:
     """Return the pose of a body from a message, with its covariance."""
     out = PoseWithCovarianceStamped(header=message.header)
@@ -127,16 +117,13 @@ def odometry(content: BodiesContent, message: BodyPoses, row: int) -> Odometry:
 
 def transforms_of_bodies(content: BodiesContent, message: BodyPoses, parent: str) -> TFMessage:
     """Return the frames of the measured bodies, as children of the rig frame."""
-    out = TFMessage()
-    for row in content.measured:
-        name = message.body[row]
-        stamped = TransformStamped(header=content.header(parent), child_frame_id=name)
-        pose = pose_of(message, row)
-        stamped.transform.rotation = pose.orientation
-        for axis in 'xyz':
-            setattr(stamped.transform.translation, axis, getattr(pose.position, axis))
-        out.transforms.append(stamped)
-    return out
+    stamp = message.header.stamp
+    return TFMessage(
+        transforms=[
+            transform_of(stamp, parent, message.body[row], pose_of(message, row))
+            for row in content.measured
+        ]
+    )
 
 
 def _point(xyz_mm: NDArray[np.float64]) -> Point:
@@ -208,7 +195,15 @@ def rigid_bodies(content: BodiesContent, message: BodyPoses) -> mocap.RigidBodie
     return out
 
 
-# Further message types for all bodies of an exposure, published while they have subscribers.
+# Further message types, published while they have subscribers: of each body that an exposure shows
+# (row of the message), and of all of them together.
+BODY_FORMS = {
+    'pose': (
+        PoseWithCovarianceStamped,
+        lambda _, message, row: pose_with_covariance(message, row),
+    ),
+    'odometry': (Odometry, odometry),
+}
 FORMS = {'body_markers': (MarkerArray, body_markers)}
 if vision is not None:
     FORMS['body_detections'] = (vision.Detection3DArray, detections)
@@ -237,7 +232,7 @@ def message_from_joints(content: BodiesContent) -> JointAngles:
     return message
 
 
-def joint_state(content: BodiesContent) -> JointState:
+def joint_state(content: BodiesContent, _: BodyPoses | None = None) -> JointState:
     """Return the angles of measured joints, named <joint>_<angle>."""
     out = JointState(header=content.header())
     for motion in content.joints:

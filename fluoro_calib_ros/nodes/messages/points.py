@@ -151,7 +151,6 @@ try:
     from mocap4r2_msgs import msg as mocap
 except ImportError:
     mocap = None
-MOCAP_MARKERS = None if mocap is None else mocap.Markers
 
 
 def mocap_markers(message: ReconstructedPoints, good: NDArray[np.int64]) -> mocap.Markers:
@@ -203,3 +202,9 @@ def point_cloud(message: ReconstructedPoints, good: NDArray[np.int64]) -> PointC
     ]
     cloud.data = uint8_field(points.view(np.uint8))
     return cloud
+
+
+# Further message types of the good points (indices), published while they have subscribers.
+POINT_FORMS = {'points': (PointCloud2, point_cloud)}
+if mocap is not None:
+    POINT_FORMS['mocap_markers'] = (mocap.Markers, mocap_markers)

@@ -6,9 +6,11 @@
 from __future__ import annotations
 
 import numpy as np
-from fluoro_calib_msgs.msg import RigOrientation
-from geometry_msgs.msg import TransformStamped
+from builtin_interfaces.msg import Time
+from fluoro_calib_msgs.msg import BodyPoses, RigOrientation
+from geometry_msgs.msg import Pose, TransformStamped
 from numpy.typing import NDArray
+from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from ...errors import DataError
@@ -44,20 +46,34 @@ def transforms_of_orientation(
     """
     if calibrated is not None:
         return _with_corrections(message, rig_frame, calibrated)
+    stamp = message.header.stamp
+    frame = message.header.frame_id
     out = TFMessage()
-    message_frame = message.header.frame_id
-    if message_frame != rig_frame and message_frame not in message.optical_frame_id:
-        out.transforms.append(_transform(message, rig_frame, message_frame))
-    for i, child in enumerate(message.optical_frame_id):
-        if child == rig_frame:
-            continue
-        stamped = _transform(message, rig_frame, child)
-        for name in 'xyz':
-            setattr(stamped.transform.translation, name, getattr(message, name)[i])
-        for name in 'xyzw':
-            setattr(stamped.transform.rotation, name, getattr(message, f'q{name}')[i])
-        out.transforms.append(stamped)
+    if frame != rig_frame and frame not in message.optical_frame_id:
+        out.transforms.append(transform_of(stamp, rig_frame, frame, Pose()))
+    for row, child in enumerate(message.optical_frame_id):
+        if child != rig_frame:
+            out.transforms.append(transform_of(stamp, rig_frame, child, pose_of(message, row)))
     return out
+
+
+def pose_of(message: RigOrientation | BodyPoses, row: int) -> Pose:
+    """Return a pose from the arrays x, y, z, qx, qy, qz and qw of a message."""
+    pose = Pose()
+    for name in 'xyz':
+        setattr(pose.position, name, getattr(message, name)[row])
+    for name in 'xyzw':
+        setattr(pose.orientation, name, getattr(message, f'q{name}')[row])
+    return pose
+
+
+def transform_of(stamp: Time, parent: str, child: str, pose: Pose) -> TransformStamped:
+    """Return the transform of a frame with a pose in its parent."""
+    stamped = TransformStamped(header=Header(stamp=stamp, frame_id=parent), child_frame_id=child)
+    stamped.transform.rotation = pose.orientation
+    for axis in 'xyz':
+        setattr(stamped.transform.translation, axis, getattr(pose.position, axis))
+    return stamped
 
 
 def _with_corrections(
@@ -105,14 +121,6 @@ def _set_pose(
         setattr(stamped.transform.translation, name, float(value))
     for name, value in zip('wxyz', turn):
         setattr(stamped.transform.rotation, name, float(value))
-
-
-def _transform(message: RigOrientation, parent: str, child: str) -> TransformStamped:
-    """Return an identity transform with the stamp of a message."""
-    stamped = TransformStamped(child_frame_id=child)
-    stamped.header.stamp = message.header.stamp
-    stamped.header.frame_id = parent
-    return stamped
 
 
 _INTERIOR = ('xp', 'yp', 'c')

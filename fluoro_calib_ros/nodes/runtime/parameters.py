@@ -390,6 +390,14 @@ def check_fluoroscopes(names: tuple[str, ...], minimum: int = 1) -> None:
             )
 
 
+def check_frame(name: str) -> None:
+    """Raise ValueError for a name that tf2 does not accept for a frame."""
+    if not name or name.startswith('/'):
+        raise ValueError(
+            f'rig_frame: {name!r} is no name of a frame in tf2: it is empty or begins with a /'
+        )
+
+
 def check_timeout(seconds: float) -> None:
     """Raise ValueError for a time that a node cannot wait."""
     if not 0 < seconds <= MAX_TIMEOUT_S:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..bodies.body import Body, solvable_bodies
 from ..bodies.tracking import BodyTracker, JointTracker, TrackedExposure, poses_of, twists_of
 from ..checks.rig_watch import RigDriftWatch
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..exposures.stamps import Order, StampOrder
 from ..io.bodies import JointEntry, read_bodies, read_joints
 from ..io.calibration import load_orientation, orientation_path
@@ -243,25 +243,22 @@ def read_body_files(parameters: BodyParameters) -> tuple[tuple[Body, ...], tuple
     if not parameters.bodies:
         return (), ()
     path = expand_path(parameters.bodies)
-    try:
-        bodies = solvable_bodies(read_bodies(path))
+    bodies = read_bodies(path)
+    with ErrorsAt(path):
+        bodies = solvable_bodies(bodies)
         for body in bodies:
             if not BODY_NAME.fullmatch(body.name):
                 raise DataError(
                     f'body {body.name!r}: a name in topics has letters, digits and _, and begins '
                     'with a letter'
                 )
-    except DataError as error:
-        raise error.at(path) from None
     if not parameters.joints:
         return bodies, ()
     path = expand_path(parameters.joints)
     joints = read_joints(path, bodies)
-    for entry in joints:
-        try:
+    with ErrorsAt(path):
+        for entry in joints:
             JointTracker(entry.joint, entry.neutral)
-        except DataError as error:
-            raise error.at(path) from None
     return bodies, joints
 
 

@@ -442,3 +442,10 @@ def test_file_with_bodies_that_cannot_be_followed_is_refused(rows, tmp_path):
 def test_joints_need_bodies():
     with pytest.raises(ValueError, match='bodies'):
         BodyParameters(joints='joints.toml')
+
+
+def test_a_missing_file_of_bodies_is_named_once(tmp_path):
+    path = tmp_path / 'bodies.csv'
+    with pytest.raises(DataError) as refused:
+        read_body_files(BodyParameters(bodies=str(path)))
+    assert str(refused.value) == f'{path}: there is no such file'

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import threading
 import time
-import traceback
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
-import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.publisher import Publisher
 from rclpy.time import Time
@@ -31,9 +29,9 @@ from ..io.bags.metadata import known_definition
 from ..io.bags.reader import TopicInfo, iterate_messages, topics_of
 from ..io.bags.recording import PlayingOptions
 from ..options import option
-from .runtime.diagnostics import StartError, Trace, one_line
+from .runtime.diagnostics import StartError, one_line
 from .runtime.main import run
-from .runtime.parameters import READ_LIMITS, ParameterGroup, ParameterNode, declare_read_limits
+from .runtime.parameters import READ_LIMITS, ParameterGroup, declare_read_limits
 from .runtime.services import ServiceEntry, create_services
 from .runtime.topics import (
     clock_qos,
@@ -45,6 +43,7 @@ from .runtime.topics import (
     wait_for_readers,
     wait_until_acknowledged,
 )
+from .runtime.worker import WorkerNode
 
 LONGEST_S = 3600.0  # of a single wait
 
@@ -157,7 +156,7 @@ _NODE = ParameterGroup(PlayerParameters, settable=('rate', 'loop'))
 PARAMETERS = (_NODE, READ_LIMITS)
 
 
-class PlayerNode(ParameterNode):
+class PlayerNode(WorkerNode):
     """Plays a bag once or in a loop; stamps are those of the recording."""
 
     def __init__(self) -> None:
@@ -176,10 +175,7 @@ class PlayerNode(ParameterNode):
         )
         create_services(self, services)
         self._publish_clock()
-        self.failed = False
-        self._stopping = threading.Event()
-        self._worker = threading.Thread(target=self._play, daemon=True)
-        self._worker.start()
+        self.start()
 
     def _use(self, settings: PlayerParameters) -> None:
         """Apply new settings from now on."""
@@ -294,31 +290,18 @@ class PlayerNode(ParameterNode):
         if not awaited:
             awaited = [output for output, kind in kinds.items() if kind in OTHER_STREAMS]
             count = min(count, 1) if awaited else count
-        wait_for_readers(self, awaited or list(kinds), count, self._stopping)
+        wait_for_readers(self, awaited or list(kinds), count, self.stopping)
 
-    def _play(self) -> None:
-        try:
-            outputs = self._outputs.values()
-            self._wait_for_readers()
-            while not self._stopping.is_set():
-                self._play_once()
-                if not self._settings.loop:
-                    break
-            arrived = wait_until_acknowledged(outputs, self._stopping)
-            if not arrived and not self._stopping.is_set():
-                self.get_logger().warning(
-                    'not all messages have arrived: a reader does not respond'
-                )
-        except DataError as error:
-            self.get_logger().fatal(str(error))
-            self.failed = True
-        except Exception:
-            if rclpy.ok():  # else the node was ended between two messages
-                self.get_logger().fatal(Trace(traceback.format_exc()))
-                self.failed = True
-        finally:
-            if rclpy.ok():
-                rclpy.shutdown()
+    def work(self) -> None:
+        """Play the bag once or in a loop. Raises DataError."""
+        self._wait_for_readers()
+        while not self.stopping.is_set():
+            self._play_once()
+            if not self._settings.loop:
+                break
+        arrived = wait_until_acknowledged(self._outputs.values(), self.stopping)
+        if not arrived and not self.stopping.is_set():
+            self.get_logger().warning('not all messages have arrived: a reader does not respond')
 
     def _play_once(self) -> None:
         """Publish every message at its time; before the start offset, only latched ones."""
@@ -349,9 +332,8 @@ class PlayerNode(ParameterNode):
 
     def stop(self) -> None:
         """Stop playing before the node is destroyed."""
-        self._stopping.set()
         self._pace.end()
-        self._worker.join(2.0)
+        super().stop()
 
 
 def _channels_of(bag: str) -> dict[str, ChannelInfo]:

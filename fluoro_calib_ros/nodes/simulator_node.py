@@ -6,15 +6,12 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
-import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import rclpy
 from fluoro_calib_msgs.msg import TargetObservations
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
@@ -36,9 +33,9 @@ from ..simulation.rig import (
 )
 from .messages.image import message_from_image
 from .messages.observations import message_from_frame, set_number_and_stamp, stamp_from_nanoseconds
-from .runtime.diagnostics import StartError, Trace
+from .runtime.diagnostics import StartError
 from .runtime.main import run
-from .runtime.parameters import ParameterGroup, ParameterNode, RigParameters
+from .runtime.parameters import ParameterGroup, RigParameters
 from .runtime.topics import (
     images_qos,
     observations_qos,
@@ -46,6 +43,7 @@ from .runtime.topics import (
     wait_for_readers,
     wait_until_acknowledged,
 )
+from .runtime.worker import WorkerNode
 
 SCENES = ('phantom', 'standing', 'markers', 'grid')
 GRID_FRAMES = 300  # of the grid, which are repeated: 45 MB
@@ -115,7 +113,7 @@ _NODE = ParameterGroup(SimulatorParameters)
 PARAMETERS = (_NODE,)
 
 
-class SimulatorNode(ParameterNode):
+class SimulatorNode(WorkerNode):
     """Publishes target observations or radiographs of every fluoroscope, with current stamps."""
 
     def __init__(self) -> None:
@@ -128,22 +126,19 @@ class SimulatorNode(ParameterNode):
         self._with_images = parameters.images != 'none'
         if self._with_images and parameters.scene == 'grid':
             raise StartError('parameter images: there are no radiographs of the scene grid')
+        kind, topic, qos = TargetObservations, 'target_observations', observations_qos
+        if self._with_images:
+            kind, topic, qos = Image, 'image_raw', images_qos
         self._outputs = {
             name: self.create_publisher(
-                Image if self._with_images else TargetObservations,
-                f'{name}/image_raw' if self._with_images else f'{name}/target_observations',
-                images_qos() if self._with_images else observations_qos(),
-                qos_overriding_options=qos_overrides(),
+                kind, f'{name}/{topic}', qos(), qos_overriding_options=qos_overrides()
             )
             for name in parameters.fluoroscopes
         }
         self._moving_mm = np.zeros((0, 0, 3))  # positions of the markers for radiographs
         self._precomputed = self._precompute()
         self._renderers: Renderers | None = None
-        self._stopping = threading.Event()
-        self.failed = False
-        self._worker = threading.Thread(target=self._run, daemon=True)
-        self._worker.start()
+        self.start()
 
     def _precompute(self) -> dict[str, list[TargetObservations]]:
         """Return the messages of a repeated scene; empty for a scene that is generated live."""
@@ -168,38 +163,28 @@ class SimulatorNode(ParameterNode):
             for name, of_fluoroscope in frames.items()
         }
 
-    def _run(self) -> None:
+    def work(self) -> None:
         """Publish frame after frame from a thread: a timer of rclpy costs more than a frame."""
         parameters = self._settings
         outputs = self._outputs.values()
-        try:
-            if self._with_images:
-                self._start_rendering()
-            wait_for_readers(self, outputs, parameters.wait_for_readers, self._stopping)
-            start = time.monotonic()
-            number = 0
-            while not (parameters.frames and number >= parameters.frames):
-                due = start + number / parameters.rate
-                if self._stopping.wait(max(0.0, due - time.monotonic())):
-                    return
-                number += 1
-                if not self._with_images:
-                    self._publish(number)
-                    continue
-                # Skip missed frames, like a camera that is too slow.
-                due_number = math.floor((time.monotonic() - start) * parameters.rate)
-                number = max(number, min(due_number, parameters.frames or due_number))
-                self._publish_images(number)
-            wait_until_acknowledged(outputs, self._stopping)
-            rclpy.try_shutdown()
-        except Exception:
-            if not self._stopping.is_set():  # else the node was ended between two messages
-                self.get_logger().fatal(Trace(traceback.format_exc()))
-                self.failed = True
-                rclpy.try_shutdown()
-        finally:
-            if self._renderers is not None:
-                self._renderers.close()
+        if self._with_images:
+            self._start_rendering()
+        wait_for_readers(self, outputs, parameters.wait_for_readers, self.stopping)
+        start = time.monotonic()
+        number = 0
+        while not (parameters.frames and number >= parameters.frames):
+            due = start + number / parameters.rate
+            if self.stopping.wait(max(0.0, due - time.monotonic())):
+                return
+            number += 1
+            if not self._with_images:
+                self._publish(number)
+                continue
+            # Skip missed frames, like a camera that is too slow.
+            due_number = math.floor((time.monotonic() - start) * parameters.rate)
+            number = max(number, min(due_number, parameters.frames or due_number))
+            self._publish_images(number)
+        wait_until_acknowledged(outputs, self.stopping)
 
     def _start_rendering(self) -> None:
         """Start the rendering processes, and wait until they are ready."""
@@ -221,12 +206,11 @@ class SimulatorNode(ParameterNode):
 
     def _rendered_scene(self, number: int) -> RenderedScene:
         """Return the scene that the fluoroscopes see in an exposure."""
-        standing = np.eye(3), np.zeros(3)
+        pose = self._pose(number)
         if self._settings.scene == 'markers':
             points = self._moving_mm[(number - 1) % len(self._moving_mm)]
             diameter = np.full(len(points), MARKER_MM)
-            return RenderedScene(points, standing, number, diameter, plates=False)
-        pose = self._pose(number) if self._settings.scene == 'phantom' else standing
+            return RenderedScene(points, pose, number, diameter, plates=False)
         return RenderedScene(self._rig.true_mm, pose, number)
 
     def _publish(self, number: int) -> None:
@@ -248,10 +232,7 @@ class SimulatorNode(ParameterNode):
 
     def _phantom_frames(self, number: int) -> Iterator[Frame]:
         """Yield the frames of the phantom in its current pose."""
-        parameters = self._settings
-        rotation, shift = (
-            self._pose(number) if parameters.scene == 'phantom' else (np.eye(3), np.zeros(3))
-        )
+        rotation, shift = self._pose(number)
         points = self._rig.true_mm @ rotation.T + shift
         for fluoroscope in self._rig.fluoroscopes:
             ids, uv = detect_beads(
@@ -271,7 +252,9 @@ class SimulatorNode(ParameterNode):
             )
 
     def _pose(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the current pose: standing, or moving to the next pose."""
+        """Return the current pose of the phantom: standing, or moving to the next pose."""
+        if self._settings.scene != 'phantom':
+            return np.eye(3), np.zeros(3)
         stand_s = self._settings.stand_time
         move_s = self._settings.move_time
         cycle_s = stand_s + move_s
@@ -286,10 +269,10 @@ class SimulatorNode(ParameterNode):
 
     def stop(self) -> None:
         """Stop publishing before the node is destroyed."""
-        self._stopping.set()
+        self.stopping.set()
         if self._renderers is not None:
             self._renderers.close()
-        self._worker.join(2.0)
+        super().stop()
 
 
 main = partial(run, SimulatorNode)

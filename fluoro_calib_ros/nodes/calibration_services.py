@@ -9,6 +9,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from fluoro_calib_msgs.action import SelfCalibrate
@@ -40,7 +41,7 @@ from .messages.self_calibration import (
     options_of_request,
 )
 from .runtime.parameters import check_timeout
-from .runtime.services import ServiceEntry, in_thread, wake, within
+from .runtime.services import Cancelled, ServiceEntry, in_thread, wake, within
 
 
 class _Capture:
@@ -158,10 +159,6 @@ class OrientationService(RigServices):
         )
 
 
-class Cancelled(Exception):
-    """Raised when the running job has to stop."""
-
-
 class Job(RigServices, ABC):
     """Runs one job of an action at a time, in a separate process."""
 
@@ -171,9 +168,7 @@ class Job(RigServices, ABC):
 
     def __init__(self, parts: NodeParts) -> None:
         super().__init__(parts)
-        self._stopping = threading.Event()
         self._is_running = False
-        self._thread: threading.Thread | None = None  # waits for the process of the job
 
     def create_action(self, group: CallbackGroup) -> ActionServer:
         """Return the action server."""
@@ -186,16 +181,6 @@ class Job(RigServices, ABC):
             cancel_callback=self._on_cancel,
             callback_group=group,
         )
-
-    def stop(self) -> None:
-        """Cancel the running job and all later ones."""
-        self._stopping.set()
-
-    def end(self) -> None:
-        """Cancel the running job and wait for it to end."""
-        self.stop()
-        if self._thread is not None:
-            self._thread.join()
 
     @abstractmethod
     async def _work(self, goal: Any, result: Any) -> None:
@@ -244,11 +229,6 @@ class Job(RigServices, ABC):
             self._thread = None
         return False
 
-    def _raise_if_cancelled(self, is_cancel_requested: bool) -> None:
-        """Raise Cancelled if the job has to stop."""
-        if is_cancel_requested or self._stopping.is_set():
-            raise Cancelled
-
 
 class SelfCalibration(Job):
     """The action self_calibrate, and the service calibrate."""
@@ -283,7 +263,7 @@ class SelfCalibration(Job):
         is_cancel_requested: Callable[[], bool],
     ) -> None:
         try:
-            outcome = await self._start(request, publish, is_cancel_requested)
+            outcome = await self._start_job(request, publish, is_cancel_requested)
             self._use(outcome, result)
             if request.validate and not self._output.save_fault:
                 await self._write_report()
@@ -295,7 +275,7 @@ class SelfCalibration(Job):
         finally:
             self.running = ()
 
-    def _start(
+    def _start_job(
         self,
         request: Request,
         publish: Callable[[SelfCalibrate.Feedback], None],
@@ -313,33 +293,24 @@ class SelfCalibration(Job):
             self.last_round.update(dict.fromkeys(label.split('+'), last))
             publish(feedback_of_round(label, last))
 
-        def run() -> CalibrationOutcome:
-            return run_in_worker_process(
-                job,
-                validate=request.validate,
-                rig=rig,
-                progress=on_round,
-                report_step=lambda stage, step, steps: publish(
-                    SelfCalibrate.Feedback(stage=stage, step=step, steps=steps)
-                ),
-                raise_if_cancelled=lambda: self._raise_if_cancelled(is_cancel_requested()),
-            )
-
-        future, self._thread = in_thread(self._node, run)
-        return future
+        work = partial(
+            run_in_worker_process,
+            job,
+            validate=request.validate,
+            rig=rig,
+            progress=on_round,
+            report_step=lambda stage, step, steps: publish(
+                SelfCalibrate.Feedback(stage=stage, step=step, steps=steps)
+            ),
+        )
+        return self._start(work, is_cancel_requested)
 
     async def _write_report(self) -> None:
         """Write the report of the saved calibration; a failure is only logged."""
-        future, self._thread = in_thread(
-            self._node,
-            lambda: in_worker_process(
-                'jobs.report:write_report',  # imports matplotlib
-                self._rig.directory,
-                raise_if_cancelled=lambda: self._raise_if_cancelled(False),
-            ),
-        )
+        write = 'jobs.report:write_report'  # imports matplotlib
+        work = partial(in_worker_process, write, self._rig.directory)
         try:
-            self._logger.info(f'report: {await future}')
+            self._logger.info(f'report: {await self._start(work)}')
         except Cancelled:
             self._logger.info('the node ends: no report of the calibration is written')
         except (DataError, ValueError, OSError, RuntimeError) as error:

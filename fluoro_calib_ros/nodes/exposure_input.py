@@ -37,7 +37,7 @@ from .messages.status import Collected
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
 from .runtime.lifecycle import Stream, StreamNode
 from .runtime.parameters import check_timeout
-from .runtime.services import Requests, ServiceEntry, within
+from .runtime.services import Requests, ServiceEntry, Worker, telling_service, within
 
 
 def _no_angle() -> None:
@@ -312,12 +312,13 @@ class NodeParts:
     requests: Requests
 
 
-class RigServices:
+class RigServices(Worker):
     """Services of a calibration node, listed in `services`."""
 
     services: tuple[ServiceEntry, ...]
 
     def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts.node)
         self._node = parts.node
         self._rig = parts.rig
         self._exposures = parts.exposures
@@ -334,8 +335,8 @@ class CollectServices(RigServices):
         super().__init__(parts)
         self.services = (
             ServiceEntry('capture', Capture, self._on_capture),
-            ServiceEntry('reset', Reset, self._on_reset),
-            ServiceEntry('collect_anew', Reset, self._on_collect_anew),
+            telling_service('reset', Reset, 'not reset', self._reset, self._logger),
+            telling_service('collect_anew', Reset, 'not reset', self._anew, self._logger),
         )
 
     async def _on_capture(
@@ -379,18 +380,14 @@ class CollectServices(RigServices):
                 f'{waiting} requests wait for their answers, as many as max_waiting allows'
             )
 
-    def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
+    def _reset(self, _: Reset.Request) -> str:
         count = self._exposures.reset()
         self._output.refused.clear()
-        response.success = True
-        response.message = f'{count} exposures discarded, the calibration stays in use'
-        return response
+        return f'{count} exposures discarded, the calibration stays in use'
 
-    def _on_collect_anew(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
+    def _anew(self, request: Reset.Request) -> str:
         self._node.set_parameters([Parameter('collect', value='still')])
-        self._on_reset(request, response)
-        response.message += (
-            '; new exposures are collected whenever the phantom stands still in a new pose'
+        return (
+            f'{self._reset(request)}; new exposures are collected whenever the phantom stands '
+            'still in a new pose'
         )
-        self._logger.info(response.message)
-        return response

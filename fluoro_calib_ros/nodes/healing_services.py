@@ -12,6 +12,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ from .calibration_settings import MAX_HEAL_S, NOT_ACTIVE, check_folders
 from .exposure_input import NodeParts
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.self_calibration import fill_healing
-from .runtime.services import in_thread, telling_service, wake, within
+from .runtime.services import telling_service, wake, within
 
 MAX_FRAMES = 20_000  # maximum number collected per fluoroscope, whatever its rate
 PAUSE_S = 1.0  # longest interval between frames that counts as time in which markers are seen
@@ -167,11 +168,8 @@ class Healing(Job):
         rig = self._present_rig()
         self._healed = None
 
-        def raise_if_cancelled() -> None:
-            self._raise_if_cancelled(goal.is_cancel_requested)
-
         frames = await self._collected(goal, rig, seconds)
-        raise_if_cancelled()
+        self._raise_if_cancelled(goal.is_cancel_requested)
         if not frames:
             raise DataError(f'no frame with a marker of a body came within {seconds:g} s')
         pairing = self._rig.settings().pairing
@@ -183,16 +181,9 @@ class Healing(Job):
                 Heal.Feedback(stage='diagnosing', frames=count, step=step, steps=steps)
             )
 
-        future, self._thread = in_thread(
-            self._node,
-            lambda: in_worker_process(
-                heal_rig,
-                *(frames, rig.calibrations, rig.orientation, rig.learned.bodies, options),
-                progress=progress,
-                raise_if_cancelled=raise_if_cancelled,
-            ),
-        )
-        outcome = await future
+        rig_to_heal = frames, rig.calibrations, rig.orientation, rig.learned.bodies
+        work = partial(in_worker_process, heal_rig, *rig_to_heal, options, progress=progress)
+        outcome = await self._start(work, lambda: goal.is_cancel_requested)
         self._check_unchanged(rig)
         fill_healing(result, outcome, rig.orientation)
         self._logger.info(result.message)

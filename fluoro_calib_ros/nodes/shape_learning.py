@@ -9,8 +9,8 @@ and shapes are estimated from them in a separate process.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
+from functools import partial
 
 from fluoro_calib_msgs.msg import DriftStatus
 from rclpy.task import Future
@@ -25,13 +25,12 @@ from ..jobs.learning import DRIFTED, learn_shapes, learned_for
 from ..jobs.result_folder import belongs_to
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import in_worker_process
-from .calibration_services import Cancelled
 from .exposure_input import NodeParts, RigServices
 from .healing_services import MarkerCollection
 from .messages.observations import ObservedFrame
 from .runtime.diagnostics import OK, WARN, Health, Status
 from .runtime.parameters import expand_path
-from .runtime.services import in_thread
+from .runtime.services import Cancelled
 
 DRIFT = 'the drift watch has given an alarm: no shapes are learned before the next calibration'
 
@@ -46,8 +45,7 @@ class ShapeLearning(RigServices):
         self._bodies = _declared(self._rig.settings().node.learn_bodies)
         self._orientation: RigOrientation | None = None  # orientation in use while learning
         self._window: MarkerCollection | None = None
-        self._job: tuple[Future, threading.Thread] | None = None
-        self._stopping = threading.Event()
+        self._job: Future | None = None
         self._alarmed = False  # whether the drift watch has raised an alarm for this orientation
         self._learned: LearnedShapes | None = None
         self._refusal = ''  # why the last shapes were not learned
@@ -72,20 +70,14 @@ class ShapeLearning(RigServices):
             except (DataError, OSError) as error:
                 self._logger.error(f'the alarm of the drift watch is not saved: {error}')
 
-    def end(self) -> None:
-        """Cancel a running job and wait for it to end."""
-        self._stopping.set()
-        if self._job is not None:
-            self._job[1].join()
-
     def diagnose(self) -> list[Status]:
         """Take the next step; return the progress of learning, empty without bodies to learn."""
         if not self._bodies:
             return []
         if self._orientation is not self._output.orientation:
             self._begin_anew()
-        if self._job is not None and self._job[0].done():
-            self._finish(self._job[0])
+        if self._job is not None and self._job.done():
+            self._finish(self._job)
         return [Status('shapes', *self._step())]
 
     def _begin_anew(self) -> None:
@@ -127,27 +119,20 @@ class ShapeLearning(RigServices):
             window = self._window = MarkerCollection(self._bodies, calibrations, seconds)
         if window.is_complete:
             self._window = None
-            self._start(window, orientation)
+            self._estimate(window, orientation)
         refusal = f'not learned: {self._refusal}; ' if self._refusal else ''
         return Health(WARN if refusal else OK, f'{refusal}markers seen for {window.seen_s:.1f} s')
 
-    def _start(self, window: MarkerCollection, orientation: RigOrientation) -> None:
+    def _estimate(self, window: MarkerCollection, orientation: RigOrientation) -> None:
         """Estimate shapes in another process."""
         pairing = self._rig.settings().pairing
         options = BodiesOptions(pairing.pair_by, pairing.tolerance_s)
         calibrations = self._output.calibrations
 
-        def raise_if_cancelled() -> None:
-            if self._stopping.is_set() or self._orientation is not orientation or self._alarmed:
-                raise Cancelled
-
-        self._job = in_thread(
-            self._node,
-            lambda: in_worker_process(
-                learn_shapes,
-                *(window.frames, calibrations, orientation, self._bodies, options),
-                raise_if_cancelled=raise_if_cancelled,
-            ),
+        arguments = window.frames, calibrations, orientation, self._bodies, options
+        self._job = self._start(
+            partial(in_worker_process, learn_shapes, *arguments),
+            lambda: self._orientation is not orientation or self._alarmed,
         )
 
     def _finish(self, done: Future) -> None:

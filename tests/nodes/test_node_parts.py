@@ -359,7 +359,7 @@ def test_a_calibration_that_ends_without_result_is_a_fault_unless_it_was_cancell
     async def ended():
         raise end
 
-    monkeypatch.setattr(calibration_services, 'in_thread', lambda *_: (ended(), None))
+    monkeypatch.setattr(SelfCalibration, '_start', lambda *_: ended())
     with pytest.raises(type(end)):
         service._calibrate(Calibrate.Request(), None, print, lambda: False).send(None)
     is_fault = not isinstance(end, calibration_services.Cancelled)

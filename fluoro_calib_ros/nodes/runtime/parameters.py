@@ -143,8 +143,8 @@ class ParameterGroup(Generic[T]):
     """Options of a dataclass as parameters of a node."""
 
     options: type[T]  #: frozen dataclass that declares them
-    #: parameter names by option name; empty: all options under their own names
-    names: Mapping[str, str] = field(default_factory=dict)
+    #: parameter names by option name, or options under their own names; empty: all of them
+    names: Mapping[str, str] | Sequence[str] = ()
     #: names of the parameters that may change while the node runs, see follow(); all others are
     #: read-only
     settable: Sequence[str] = ()
@@ -152,7 +152,9 @@ class ParameterGroup(Generic[T]):
     @property
     def _names(self) -> Mapping[str, str]:
         """Parameter names by option name."""
-        return self.names or {name: name for name in declared(self.options)}
+        if isinstance(self.names, Mapping):
+            return self.names
+        return {name: name for name in self.names or declared(self.options)}
 
     @property
     def declarations(self) -> dict[str, Option]:
@@ -214,10 +216,10 @@ class ParameterGroup(Generic[T]):
 
 
 def group(
-    options: type[T], names: Mapping[str, str] | None = None, settable: Sequence[str] = ()
+    options: type[T], names: Mapping[str, str] | Sequence[str] = (), settable: Sequence[str] = ()
 ) -> Any:
     """Declare a field of a settings dataclass: the options of a `ParameterGroup`."""
-    return field(metadata={_GROUP: ParameterGroup(options, names or {}, settable)})
+    return field(metadata={_GROUP: ParameterGroup(options, names, settable)})
 
 
 def groups_of(settings: type[Any]) -> dict[str, ParameterGroup[Any]]:

@@ -181,6 +181,46 @@ def in_thread(node: Node, function: Callable[[], Any]) -> tuple[Future, threadin
     return done, thread
 
 
+class Cancelled(Exception):
+    """Raised when running work has to stop."""
+
+
+class Worker:
+    """Runs work in a thread, which can be cancelled and ends with its node."""
+
+    def __init__(self, node: Node) -> None:
+        self._node: Any = node
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def stop(self) -> None:
+        """Cancel the running work and all later one."""
+        self._stopping.set()
+
+    def end(self) -> None:
+        """Cancel the running work and wait for its end."""
+        self.stop()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _start(self, work: Callable[..., Any], is_cancelled: Callable[[], bool] = bool) -> Future:
+        """Start work in a thread; return the Future of its result.
+
+        work: called with the argument raise_if_cancelled, a function to call repeatedly.
+        """
+
+        def run() -> Any:
+            return work(raise_if_cancelled=lambda: self._raise_if_cancelled(is_cancelled()))
+
+        future, self._thread = in_thread(self._node, run)
+        return future
+
+    def _raise_if_cancelled(self, is_cancelled: bool = False) -> None:
+        """Raise Cancelled if the work has to stop."""
+        if is_cancelled or self._stopping.is_set():
+            raise Cancelled
+
+
 def wake(node: Node) -> None:
     """Make the executor of a node resume coroutines that await a result of another thread."""
     if node.executor is not None:

@@ -26,6 +26,7 @@ from fluoro_calib_msgs.msg import (
 )
 from rclpy.action import ActionClient
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo
 
@@ -53,7 +54,6 @@ class DemoClient(Node):
     def __init__(self, names: Sequence[str], namespace: str = '') -> None:
         super().__init__('demo_client', namespace=namespace)
         self.names = tuple(names)  #: fluoroscopes
-        self.exposures: dict[str, int] = {}  #: number of collected exposures by fluoroscope
         #: number of subscriptions to corrected observations, as reported by the correction node
         self.corrected_readers: dict[str, int] = {}
         #: frames and their source timestamps [ns] by (fluoroscope, frame number)
@@ -62,9 +62,7 @@ class DemoClient(Node):
         #: messages and their source timestamps [ns]
         self.points: list[tuple[ReconstructedPoints, int]] = []
         self.joint_angles: list[JointAngles] = []  #: of exposures with bodies
-        self._calibrations: dict[str, FluoroscopeCalibration] = {}
-        self._camera_infos: dict[str, CameraInfo] = {}
-        self._orientations: list[RigOrientation] = []
+        self._newest: dict[str, Any] = {}  # messages by topic
         self._streams = StreamReader(
             self,
             FaultHandlers(
@@ -83,7 +81,13 @@ class DemoClient(Node):
     @property
     def calibrations(self) -> dict[str, calibration_result.FluoroscopeCalibration]:
         """Published calibrations by fluoroscope."""
-        return {name: calibration_from_message(m) for name, m in self._calibrations.items()}
+        messages = self._newest_of('calibration')
+        return {name: calibration_from_message(m) for name, m in messages.items()}
+
+    @property
+    def exposures(self) -> dict[str, int]:
+        """Number of collected exposures by fluoroscope."""
+        return {name: m.exposures for name, m in self._newest_of('calibration_status').items()}
 
     @property
     def is_correcting(self) -> bool:
@@ -91,13 +95,13 @@ class DemoClient(Node):
 
         It publishes the first CameraInfo of a fluoroscope when it does.
         """
-        return len(self._camera_infos) == len(self.names)
+        return len(self._newest_of('camera_info')) == len(self.names)
 
     @property
     def is_reconstructing(self) -> bool:
         """Whether an orientation is published and the reconstruction node receives frames."""
         readers = [self.corrected_readers.get(name, 0) for name in self.names]
-        return bool(self._orientations) and all(count > 1 for count in readers)
+        return 'rig_orientation' in self._newest and all(count > 1 for count in readers)
 
     def good_points(self) -> list[tuple[GoodPoints, int]]:
         """Return the intersected points and their source timestamps [ns]."""
@@ -140,57 +144,41 @@ class DemoClient(Node):
         self.wait(future.done, timeout_s, description)
         return future.result()
 
+    def _newest_of(self, topic: str) -> dict[str, Any]:
+        """Return the newest messages on <fluoroscope>/<topic> by fluoroscope."""
+        topics = {name: f'{name}/{topic}' for name in self.names}
+        return {name: self._newest[t] for name, t in topics.items() if t in self._newest}
+
     def _subscribe_streams(self) -> None:
-        self._streams.subscribe(
+        subscribe = partial(self._streams.subscribe, qos=observations_qos())
+        subscribe(
             ReconstructedPoints,
             'reconstruction/points_with_covariance',
             lambda message, info: self.points.append((message, info['source_timestamp'])),
-            observations_qos(),
         )
-        self._streams.subscribe(
+        subscribe(
             JointAngles,
             'reconstruction/joint_angles',
             lambda message, info: self._add_joints(message),
-            observations_qos(),
         )
-        for name in self.names:
-            self._streams.subscribe(
-                TargetObservations,
-                f'{name}/target_observations',
-                partial(self._record, self.sent, name),
-                observations_qos(),
-                decode_target_observations,
-            )
-            self._streams.subscribe(
-                CorrectedObservations,
-                f'{name}/corrected_observations',
-                partial(self._record, self.corrected, name),
-                observations_qos(),
-                decode_corrected_observations,
-            )
+        for kind, topic, frames, decode in (
+            (TargetObservations, 'target', self.sent, decode_target_observations),
+            (CorrectedObservations, 'corrected', self.corrected, decode_corrected_observations),
+        ):
+            for name in self.names:
+                record = partial(self._record, frames, name)
+                subscribe(kind, f'{name}/{topic}_observations', record, decode=decode)
 
     def _subscribe_states(self) -> None:
-        self.create_subscription(
-            RigOrientation, 'rig_orientation', self._orientations.append, latched_qos()
-        )
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+        self._keep_newest(RigOrientation, 'rig_orientation', latched_qos())
         for name in self.names:
-            self.create_subscription(
-                CalibrationStatus,
-                f'{name}/calibration_status',
-                lambda message, name=name: self.exposures.update({name: message.exposures}),
-                10,
-            )
-            for kind, topic, newest in (
-                (FluoroscopeCalibration, 'calibration', self._calibrations),
-                (CameraInfo, 'camera_info', self._camera_infos),
-            ):
-                self.create_subscription(
-                    kind,
-                    f'{name}/{topic}',
-                    lambda message, newest=newest, name=name: newest.update({name: message}),
-                    latched_qos(),
-                )
+            self._keep_newest(CalibrationStatus, f'{name}/calibration_status', 10)
+            self._keep_newest(FluoroscopeCalibration, f'{name}/calibration', latched_qos())
+            self._keep_newest(CameraInfo, f'{name}/camera_info', latched_qos())
+
+    def _keep_newest(self, kind: type, topic: str, qos: QoSProfile | int) -> None:
+        self.create_subscription(kind, topic, lambda m: self._newest.update({topic: m}), qos)
 
     def _add_joints(self, message: JointAngles) -> None:
         """Add joint angles, or remove those of an exposure that are reported as failed."""

@@ -90,7 +90,6 @@ class RecorderNode(ParameterNode):
             self._recording.start()
         except DataError as error:
             raise StartError(str(error)) from None
-        self.failed = False
         self._topics: set[str] = set()
         self._latched: dict[str, TopicToRecord] = {}
         self._overrun: Counter[str] = Counter()  # messages lost at the input by topic
@@ -100,7 +99,7 @@ class RecorderNode(ParameterNode):
             FaultHandlers(
                 lambda topic: self._limited_logger.error(f'{topic}: a message cannot be taken'),
                 lambda topic, error: self._limited_logger.error(f'{topic}: {error!r}'),
-                self._on_reader_error,
+                self.fail,
                 overrun=self._on_overrun,
             ),
             received_by_all,
@@ -165,10 +164,6 @@ class RecorderNode(ParameterNode):
         """Return a message about messages lost at the input, '' if none was lost."""
         lost = lost_text(self._overrun)
         return f'messages are lost at the input, they come too fast: {lost}' if lost else ''
-
-    def _on_reader_error(self, text: str) -> None:
-        self.failed = True
-        self.get_logger().fatal(text)
 
     def _on_timer(self) -> None:
         """Adapt subscriptions to publishers that have restarted; publish the diagnostics."""

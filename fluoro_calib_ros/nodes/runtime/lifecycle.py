@@ -12,7 +12,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-import rclpy
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
 from rclpy.publisher import Publisher
@@ -52,7 +51,6 @@ class ManagedNode(ParameterNode, LifecycleNode):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.autostart = True
-        self.failed = False
         self._starting = False
         self._fault = ''
 
@@ -77,12 +75,6 @@ class ManagedNode(ParameterNode, LifecycleNode):
             if trigger() != TransitionCallbackReturn.SUCCESS:
                 raise StartError(self._fault)
         self._starting = False
-
-    def fail(self, text: str) -> None:
-        """Log a fatal fault of the node itself, and end it with exit status 1."""
-        self.get_logger().fatal(Trace(text))
-        self.failed = True
-        rclpy.try_shutdown()
 
     def stop(self) -> None:
         """Deactivate and clean up before the node is destroyed."""

@@ -14,6 +14,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -86,9 +87,17 @@ class ParameterNode(Node):
     and setting use_sim_time must not silence the diagnostics.
     """
 
+    failed = False  #: whether the process ends with exit status 1
+
     def get_logger(self) -> Any:
         """Return a logger that is safe for any text."""
         return PrintableLogger(super().get_logger())
+
+    def fail(self, text: str) -> None:
+        """Log a fatal fault of the node itself, and end it with exit status 1."""
+        self.get_logger().fatal(text)
+        self.failed = True
+        rclpy.try_shutdown()
 
     def create_timer(
         self,
@@ -312,24 +321,17 @@ def descriptor_of(declaration: Option, read_only: bool = True) -> ParameterDescr
     )
     if declaration.choices:
         descriptor.additional_constraints = f'one of {", ".join(declaration.choices)}'
-    low = declaration.minimum
-    high = declaration.maximum
+    low, high = declaration.minimum, declaration.maximum
     if low is None and high is None:
         return descriptor
-    if isinstance(declaration.default, int):
-        descriptor.integer_range = [
-            IntegerRange(
-                from_value=-MAX_INTEGER if low is None else int(low),
-                to_value=MAX_INTEGER if high is None else int(high),
-            )
-        ]
-    else:
-        descriptor.floating_point_range = [
-            FloatingPointRange(
-                from_value=-sys.float_info.max if low is None else float(low),
-                to_value=sys.float_info.max if high is None else float(high),
-            )
-        ]
+    is_integer = isinstance(declaration.default, int)
+    kind = IntegerRange if is_integer else FloatingPointRange
+    number, most = (int, MAX_INTEGER) if is_integer else (float, sys.float_info.max)
+    limits = kind(
+        from_value=-most if low is None else number(low),
+        to_value=most if high is None else number(high),
+    )
+    setattr(descriptor, 'integer_range' if is_integer else 'floating_point_range', [limits])
     return descriptor
 
 

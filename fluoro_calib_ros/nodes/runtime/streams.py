@@ -40,6 +40,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ...limits import read_limits
+from .diagnostics import Trace
 from .topics import (
     OBSERVATION_DEPTH,
     adaptation_message,
@@ -293,7 +294,7 @@ class StreamReader:
             pass  # the node is being destroyed
         except Exception:  # the thread must not die silently
             if not self._stopping.is_set():
-                self._faults.reader_error(traceback.format_exc())
+                self._faults.reader_error(Trace(traceback.format_exc()))
 
     def _serve(self) -> None:
         served = -1

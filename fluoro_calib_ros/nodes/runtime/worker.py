@@ -20,7 +20,6 @@ class WorkerNode(ParameterNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.failed = False
         self.stopping = threading.Event()  #: set if the node has to end
         self._worker = threading.Thread(target=self._run, daemon=True)
 
@@ -42,8 +41,6 @@ class WorkerNode(ParameterNode):
         except Exception as error:
             if rclpy.ok() and not self.stopping.is_set():  # else ended between two messages
                 is_fault = isinstance(error, DataError)
-                text = str(error) if is_fault else Trace(traceback.format_exc())
-                self.get_logger().fatal(text)
-                self.failed = True
+                self.fail(str(error) if is_fault else Trace(traceback.format_exc()))
         finally:
             rclpy.try_shutdown()

@@ -118,7 +118,7 @@ def exposure_pairer(fluoroscopes: Iterable[str], options: PairingOptions | None 
     """
     names = tuple(fluoroscopes)
     if len(names) <= MIN_VIEWS:
-        return CompletePairer(names, options)
+        return CompletePairer(names, options, once=True)
     return PartialPairer(names, options)
 
 
@@ -231,11 +231,18 @@ class CompletePairer(Pairer):
     unpaired. A frame that arrives after one of its partners was displaced counts as late and as
     unpaired. Exposures may become ready in another order than that of their frames. A stream that
     restarts discards the waiting frames from before, so that they do not become partners of later
-    ones. A frame that is received again, as when two nodes publish the same stream, counts as
-    late. Raises ValueError for an unknown pair_by.
+    ones. Raises ValueError for an unknown pair_by.
+
+    once: whether a frame that is received again, as when two nodes publish the same stream, counts
+    as late, instead of making another exposure.
     """
 
-    def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
+    def __init__(
+        self,
+        fluoroscopes: Iterable[str],
+        options: PairingOptions | None = None,
+        once: bool = False,
+    ) -> None:
         super().__init__(fluoroscopes, options)
         self._waiting: dict[str, OrderedDict[int, Any]] = {
             name: OrderedDict() for name in self.fluoroscopes
@@ -246,7 +253,7 @@ class CompletePairer(Pairer):
         self._displaced: dict[str, int | None] = dict.fromkeys(self.fluoroscopes)
         # Keys and stamps of the newest frames.
         self._newest: dict[str, deque[tuple[int, int]]] = {
-            name: deque(maxlen=REPEATS) for name in self.fluoroscopes
+            name: deque(maxlen=REPEATS if once else 0) for name in self.fluoroscopes
         }
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:

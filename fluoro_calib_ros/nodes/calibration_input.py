@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrations received by a node, each prepared in a thread in parallel to the stream."""
+"""Calibrations received by a node, prepared in a thread in parallel to the stream."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ class CalibrationInput:
         self._current: dict[str, Any] = dict.fromkeys(names)
         self._next: dict[str, FluoroscopeCalibration] = {}
         self._ready: dict[str, Any] = {}  # prepared, but waiting for others
-        self._threads: dict[str, threading.Thread] = {}
+        self._thread: threading.Thread | None = None  # that prepares them, one after the other
         self._held: dict[str, dict[str, FluoroscopeCalibration]] = {name: {} for name in names}
         self._patience = dict.fromkeys(names, 0)
-        # Protects _next, _ready, _threads, _closed and the use of the node.
+        # Protects _next, _ready, _thread, _closed and the use of the node.
         self._lock = threading.Lock()
         self._closed = False
         self._subscriptions = [
@@ -164,22 +164,19 @@ class CalibrationInput:
         """Prepare a calibration in a thread."""
         with self._lock:
             self._next[name] = message
-            thread = self._threads.get(name)
-            # One thread per fluoroscope, however many calibrations come.
-            if thread is None or not thread.is_alive():
-                self._threads[name] = threading.Thread(
-                    target=self._work, args=(name,), daemon=True
-                )
-                self._threads[name].start()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._work, daemon=True)
+                self._thread.start()
 
-    def _work(self, name: str) -> None:
+    def _work(self) -> None:
         while True:
             with _PREPARING:
                 with self._lock:
-                    message = self._next.pop(name, None)
-                    if message is None:
-                        self._threads.pop(name, None)
+                    if not self._next:
+                        self._thread = None
                         return
+                    name = next(iter(self._next))
+                    message = self._next.pop(name)
                 self._use(name, message)
 
     def _use(self, name: str, message: FluoroscopeCalibration) -> None:

@@ -18,7 +18,6 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import CallbackGroup
 from rclpy.task import Future
 
-from ..checks.check import Validation
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..estimation.rounds import Round
@@ -347,7 +346,12 @@ class SelfCalibration(Job):
         orientation, fault = self._files.save_outcome(outcome, radiographs)
         if orientation is None:
             self._output.orientation = None
-        self._output.publish(calibrations, orientation, _verdict_of(outcome.validation))
+        validation = outcome.validation
+        verdict = None
+        if validation is not None:
+            found = tuple(finding.sentence for finding in validation.findings)
+            verdict = Verdict(validation.verdict, found, validation.calibration_id)
+        self._output.publish(calibrations, orientation, verdict)
         fill_result(result, outcome.result, calibrations)
         self._output.save_fault = fault
         if fault:
@@ -357,17 +361,8 @@ class SelfCalibration(Job):
             prefix = 'not used: ' if finding.severity is Severity.NOTE else ''
             self._logger.warning(f'{prefix}{finding}')
         self._logger.info(result.message)
-        if outcome.validation is not None:
-            fill_verdict(result, outcome.validation)
-            verdict = outcome.validation
-            self._logger.info(f'verdict: {verdict.verdict} ({verdict.seconds:.1f} s)')
-            for finding in verdict.findings:
+        if validation is not None:
+            fill_verdict(result, validation)
+            self._logger.info(f'verdict: {validation.verdict} ({validation.seconds:.1f} s)')
+            for finding in validation.findings:
                 self._logger.warning(finding.sentence)
-
-
-def _verdict_of(validation: Validation | None) -> Verdict | None:
-    """Return the verdict of a validation, None without one."""
-    if validation is None:
-        return None
-    findings = tuple(finding.sentence for finding in validation.findings)
-    return Verdict(validation.verdict, findings, validation.calibration_id)

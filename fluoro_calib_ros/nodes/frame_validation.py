@@ -69,7 +69,8 @@ class FrameValidator:
         sigma = frame.sigma
         count = len(frame.target_id) // 4
         if len(frame.u) != count or len(frame.v) != count or len(sigma) not in (0, count):
-            raise self._refused('lengths', frame, _length_error(frame))
+            arrays = {'u': frame.u, 'v': frame.v, **({'sigma': sigma} if len(sigma) else {})}
+            raise self._refused('lengths', frame, length_error(_target_ids(frame), **arrays))
         if frame.image_size != calibration.image_size:
             raise self._refused(
                 'image size', frame, image_size_error(frame.image_size, calibration.image_size)
@@ -100,14 +101,6 @@ class FrameValidator:
 
 def _target_ids(frame: ObservedFrame) -> NDArray[np.uint32]:
     return np.frombuffer(frame.target_id, np.uint32)
-
-
-def _length_error(frame: ObservedFrame) -> str:
-    """Return the error of the first array whose length differs from that of the target ids."""
-    arrays = {'u': frame.u, 'v': frame.v}
-    if len(frame.sigma):
-        arrays['sigma'] = frame.sigma
-    return length_error(_target_ids(frame), **arrays)
 
 
 def validate_corrected(fluoroscope: str, frame: CorrectedFrame) -> None:

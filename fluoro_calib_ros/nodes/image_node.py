@@ -104,11 +104,8 @@ class ImageNode(CorrectingNode):
         super().__init__('image_node')
         self._inputs = INPUTS[self.settings.inputs]
         self.topics = tuple(topic for _, topic in self._inputs)
-        _NODE.follow(self, self._use_settings)
+        _NODE.follow(self, partial(setattr, self, 'settings'))
         use_single_thread()
-
-    def _use_settings(self, settings: ImageParameters) -> None:
-        self.settings = settings
 
     def make_angles(self) -> dict[str, AngleInput]:
         """Return an AngleInput for each fluoroscope, as each has its own thread."""

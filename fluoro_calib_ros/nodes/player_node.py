@@ -10,6 +10,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 from rclpy.exceptions import NameValidationException
 from rclpy.publisher import Publisher
@@ -218,7 +219,12 @@ class PlayerNode(WorkerNode):
         """Return the publishers of the topics to play. Raises StartError."""
         try:
             topics = topics_of(bag)
-            channels = _channels_of(bag)
+            channels = (
+                channels_of_bag(bag)
+                if is_foreign(bag)
+                else chain.from_iterable(map(channels_of_file, storage_files(bag)))
+            )
+            channel_of = {info.channel.topic: info for info in channels}
         except DataError as error:
             raise StartError(str(error)) from None
         # Names in the bag: remapping applies to the names under which they are played.
@@ -228,7 +234,7 @@ class PlayerNode(WorkerNode):
             self.get_logger().warning(f'{bag}: there is no topic {", ".join(missing)}')
         outputs = {}
         for topic, info in topics.items():
-            if (not wanted or topic in wanted) and self._is_playable(channels[topic]):
+            if (not wanted or topic in wanted) and self._is_playable(channel_of[topic]):
                 output = self._create_output(topic, info)
                 if output is not None:
                     outputs[topic] = output
@@ -334,15 +340,6 @@ class PlayerNode(WorkerNode):
         """Stop playing before the node is destroyed."""
         self._pace.end()
         super().stop()
-
-
-def _channels_of(bag: str) -> dict[str, ChannelInfo]:
-    """Return a channel of each topic of a bag. Raises DataError."""
-    if is_foreign(bag):
-        channels = channels_of_bag(bag)
-    else:
-        channels = [info for path in storage_files(bag) for info in channels_of_file(path)]
-    return {info.channel.topic: info for info in channels}
 
 
 def is_latched(info: TopicInfo) -> bool:

@@ -309,9 +309,13 @@ class ReconstructionNode(StreamNode):
         if rig is None:
             self._without_orientation += 1
             return False
+        frames = [exposure[name].frame if name in exposure else None for name in self._names]
         views = [
-            _corrected_view(exposure[name].frame) if name in exposure else None
-            for name in self._names
+            f
+            and CorrectedView.of_columns(
+                f.target_id, (f.u, f.v, f.sigma, f.correction_sd, f.status)
+            )
+            for f in frames
         ]
         first_view = next(exposure[name] for name in self._names if name in exposure)
         self._drift.newest = rig.watch, rig.orientation, first_view.stamp_ns
@@ -389,12 +393,6 @@ class ReconstructionNode(StreamNode):
             'healed by': self._rigs.correction,
             **self._latencies.values(),
         }
-
-
-def _corrected_view(frame: CorrectedFrame) -> CorrectedView:
-    """Return the CorrectedView of a frame."""
-    columns = frame.u, frame.v, frame.sigma, frame.correction_sd, frame.status
-    return CorrectedView.of_columns(frame.target_id, columns)
 
 
 main = partial(run, ReconstructionNode)

@@ -147,7 +147,7 @@ class PointRetractions:
         self._published: PublishedExposures[tuple[str, int], PointsContent] = PublishedExposures(
             self._retract, keys=len(names)
         )
-        self.bodies = BodyRetractions(_nowhere)  #: retracts poses determined from these points
+        self.bodies: BodyRetractions | None = None  #: of poses determined from these points
         self._count = 0  # retracted points
         for name in names:
             on_retraction = partial(self.on_retraction, name)
@@ -173,12 +173,10 @@ class PointRetractions:
         out.header.frame_id = content.orientation.frame_id
         self._output.publish(out)
         self._count += len(retracted_ids)
-        self.bodies.take_back(content.stamp_ns, retracted_ids)
+        if self.bodies is not None:
+            self.bodies.take_back(content.stamp_ns, retracted_ids)
 
     def values(self) -> dict[str, int]:
         """Return the counts for the diagnostics."""
-        return {'points retracted': self._count, 'poses retracted': self.bodies.count}
-
-
-def _nowhere(content: BodiesContent) -> None:
-    """Do not publish bodies."""
+        poses = 0 if self.bodies is None else self.bodies.count
+        return {'points retracted': self._count, 'poses retracted': poses}

@@ -212,8 +212,8 @@ def test_calibration_that_comes_while_the_thread_before_it_ends_is_prepared(cali
     """The thread has found no further work but has not yet ended."""
     inbox = Inbox()
     inbox.go.set()
-    inbox.calibrations._threads['a'] = threading.current_thread()
-    inbox.calibrations._work('a')
+    inbox.calibrations._thread = threading.current_thread()
+    inbox.calibrations._work()
     inbox.put(message_from_calibration(calibration))
     assert inbox.ended.acquire(timeout=60) and len(inbox.taken) == 1
 
@@ -222,7 +222,7 @@ def test_closing_does_not_wait_for_a_calibration_and_it_is_not_used(calibration)
     inbox = Inbox()
     inbox.put(message_from_calibration(calibration))
     assert inbox.began.acquire(timeout=60)
-    (thread,) = inbox.calibrations._threads.values()
+    thread = inbox.calibrations._thread
     inbox.calibrations.close()
     inbox.go.set()
     thread.join(60)

@@ -85,10 +85,14 @@ class SessionClient(Node):
         self._session = SessionState(self.get_namespace())
         self._points_at: tuple[float, float] | None = None  # reconstructed exposures, last change
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
+        requests = {
+            CAPTURE: (Capture, Capture.Request()),
+            ORIENT: (Orient, Orient.Request(frames=10)),
+            **dict.fromkeys((RESET, ACCEPT, ROLL_BACK), (Reset, Reset.Request())),
+        }
         self._callers = {
-            CAPTURE: self.create_client(Capture, 'capture'),
-            ORIENT: self.create_client(Orient, 'orient'),
-            **{name: self.create_client(Reset, name) for name in (RESET, ACCEPT, ROLL_BACK)},
+            name: (self.create_client(kind, name), request)
+            for name, (kind, request) in requests.items()
         }
         self._actions = Actions(self, self.log, self._set)
         self._asked: dict[Future, tuple[str, float]] = {}  # request, time it was made
@@ -133,16 +137,12 @@ class SessionClient(Node):
                 self._call(action)
 
     def _call(self, action: str) -> None:
-        client = self._callers[action]
+        client, request = self._callers[action]
         if not client.service_is_ready():
             self.log(f'{action}: no calibration node answers in {self.get_namespace()}')
             return
-        requests = {
-            CAPTURE: Capture.Request,
-            ORIENT: lambda: Orient.Request(frames=10),
-        }
         self.log(f'{action.replace("_", " ")} ...')
-        future = client.call_async(requests.get(action, Reset.Request)())
+        future = client.call_async(request)
         self._asked[future] = action, time.monotonic()
         future.add_done_callback(partial(self._on_answer, action))
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -30,40 +30,26 @@ from .observations import (
 )
 
 
-def set_fields(message: Any, fields: Iterable[Field], values: Mapping[str, Any]) -> None:
-    """Set the fields of a message to the values of a record."""
-    for field in fields:
-        value = values[field.name]
-        names = field.message or (field.name,)
-        parts = [value]
-        if len(names) > 1:
-            parts = list(np.moveaxis(np.asarray(value), _axis(field), 0))
-        for name, part in zip(names, parts, strict=True):
-            setattr(message, name, _to_wire(field, part))
-
-
-def values_of_fields(where: str, message: Any, fields: Iterable[Field]) -> dict[str, Any]:
-    """Return the values of a record from a message.
-
-    Raises DataError, starting with the text `where`, for sequences of impossible length.
-    """
-    return {field.name: _value(where, message, field) for field in fields}
-
-
 def _axis(field: Field) -> int:
     """Return the axis along which a value is split into several fields of the message."""
     return field.shape.index(len(field.message))
 
 
-def _to_wire(field: Field, value: Any) -> Any:
-    """Return a value, or a part of it, in the form that rclpy accepts."""
+def _parts(field: Field, value: Any) -> Iterable[Any]:
+    """Yield a value in the form that rclpy accepts, or its parts for several fields."""
     value = np.asarray(value)
-    if not value.ndim:
-        return value.item()
-    return uint32_field(value) if field.dtype == 'int' else float64_field(value)
+    for part in np.moveaxis(value, _axis(field), 0) if len(field.message) > 1 else (value,):
+        if not part.ndim:
+            yield part.item()
+        else:
+            yield uint32_field(part) if field.dtype == 'int' else float64_field(part)
 
 
 def _value(where: str, message: Any, field: Field) -> Any:
+    """Return the value of a field from a message.
+
+    Raises DataError, starting with the text `where`, for sequences of impossible length.
+    """
     names = field.message or (field.name,)
     parts = [getattr(message, name) for name in names]
     if not field.shape:
@@ -114,7 +100,11 @@ def message_from_calibration(
     message.header.stamp = stamp_from_nanoseconds(calibration.stamp_ns)
     message.header.frame_id = calibration.frame_id
     message.seconds = calibration.seconds
-    set_fields(message, MESSAGE_FIELDS, calibration.to_values())
+    values = calibration.to_values()
+    for field in MESSAGE_FIELDS:
+        names = field.message or (field.name,)
+        for name, part in zip(names, _parts(field, values[field.name]), strict=True):
+            setattr(message, name, part)
     return message
 
 
@@ -139,7 +129,7 @@ def content_of_calibration(
 ) -> calibration_result.FluoroscopeCalibration:
     """Return the calibration of a message without comparing its id. Raises DataError."""
     where = f'calibration of fluoroscope {message.fluoroscope}'
-    values = values_of_fields(where, message, MESSAGE_FIELDS)
+    values = {field.name: _value(where, message, field) for field in MESSAGE_FIELDS}
     values['stamp_ns'] = nanoseconds_from_stamp(message.header.stamp)
     values['frame_id'] = message.header.frame_id
     values = to_values(validated_arrays(where, values))

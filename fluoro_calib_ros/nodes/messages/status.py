@@ -100,9 +100,14 @@ class FluoroscopeProgress:
 
 def message_from_progress(progress: FluoroscopeProgress, stamp: Time) -> CalibrationStatus:
     """Return the message of the progress of one fluoroscope."""
+    state = CalibrationStatus.COLLECTING
+    if progress.is_calibrating:
+        state = CalibrationStatus.CALIBRATING
+    elif progress.calibration is not None:
+        state = CalibrationStatus.CALIBRATED
     message = CalibrationStatus(
         fluoroscope=progress.fluoroscope,
-        state=_state_of(progress),
+        state=state,
         frames_received=progress.collected.received,
         frames_rejected=progress.collected.rejected,
         frames_unpaired=progress.collected.unpaired,
@@ -122,11 +127,3 @@ def message_from_progress(progress: FluoroscopeProgress, stamp: Time) -> Calibra
         message.cost_regression = last.G
         message.rmse_u, message.rmse_v = (float(x) for x in last.rmse[progress.fluoroscope])
     return message
-
-
-def _state_of(progress: FluoroscopeProgress) -> int:
-    if progress.is_calibrating:
-        return CalibrationStatus.CALIBRATING
-    if progress.calibration is not None:
-        return CalibrationStatus.CALIBRATED
-    return CalibrationStatus.COLLECTING

@@ -199,24 +199,6 @@ class ReconstructionNode(StreamNode):
         self._drift.connect(drift, collect_anew, heal)
         self._transforms = self.create_publisher(TFMessage, '/tf_static', latched_qos())
         self.own(self._transforms, self.destroy_publisher, self._transforms)
-        self._create_inputs()
-        settings = self._settings.node
-        saved = self._rigs.saved(settings.orientation_file, settings.calibration_directory)
-        if saved is not None:
-            self._on_orientation(saved)
-
-    def _create_bodies(self) -> None:
-        """Read the files of bodies and joints, and create their outputs. Raises DataError."""
-        settings = self._settings
-        bodies, joints = read_body_files(settings.bodies)
-        if bodies:
-            self._follower = BodyFollower(bodies, joints, settings.bodies.body_lag)
-            names = [body.name for body in bodies]
-            rig_frame = settings.node.rig_frame
-            self._bodies_output = BodiesOutput(self, names, bool(joints), rig_frame)
-            self._retractions.bodies = self._bodies_output.retractions
-
-    def _create_inputs(self) -> None:
         for topic, callback in (
             ('rig_orientation', self._on_orientation),
             ('rig_orientation_as_calibrated', self._on_calibrated),
@@ -230,6 +212,21 @@ class ReconstructionNode(StreamNode):
                 latched_qos(),
                 self._refusals,
             )
+        settings = self._settings.node
+        saved = self._rigs.saved(settings.orientation_file, settings.calibration_directory)
+        if saved is not None:
+            self._on_orientation(saved)
+
+    def _create_bodies(self) -> None:
+        """Read the files of bodies and joints, and create their outputs. Raises DataError."""
+        settings = self._settings
+        bodies, joints = read_body_files(settings.bodies, settings.node.rig_frame)
+        if bodies:
+            self._follower = BodyFollower(bodies, joints, settings.bodies.body_lag)
+            names = [body.name for body in bodies]
+            rig_frame = settings.node.rig_frame
+            self._bodies_output = BodiesOutput(self, names, bool(joints), rig_frame)
+            self._retractions.bodies = self._bodies_output.retractions
 
     def create_readers(self) -> None:
         """Receive the corrected observations of all fluoroscopes in one thread."""
@@ -311,11 +308,8 @@ class ReconstructionNode(StreamNode):
             return False
         frames = [exposure[name].frame if name in exposure else None for name in self._names]
         views = [
-            f
-            and CorrectedView.of_columns(
-                f.target_id, (f.u, f.v, f.sigma, f.correction_sd, f.status)
-            )
-            for f in frames
+            None if frame is None else CorrectedView.of_columns(frame.target_id, frame.columns)
+            for frame in frames
         ]
         first_view = next(exposure[name] for name in self._names if name in exposure)
         self._drift.newest = rig.watch, rig.orientation, first_view.stamp_ns
@@ -352,7 +346,14 @@ class ReconstructionNode(StreamNode):
             node=self,
             topics=tuple(f'{name}/{VIEWS}' for name in self._names),
             refusals=self._refusals,
-            recent=self._recent(),
+            recent=self.recent.growth(
+                'reconstruction',
+                refused=self._refusals.total,
+                overrun=sum(stream.overrun for stream in self._streams.values()),
+                unpaired=sum(self._pairer.unpaired.values()),
+                incomplete=self._pairer.incomplete,
+                without_orientation=self._without_orientation,
+            ),
             streams=self._streams,
             rigs=self._rigs,
             pairer=self._pairer,
@@ -361,16 +362,6 @@ class ReconstructionNode(StreamNode):
         status = Status('reconstruction', *health_of(state, CONDITIONS), self._values())
         bodies = [] if self._follower is None else statuses_of(self._follower, self.recent)
         return [status, *bodies, *self._drift.publish_state()]
-
-    def _recent(self) -> dict[str, int]:
-        return self.recent.growth(
-            'reconstruction',
-            refused=self._refusals.total,
-            overrun=sum(stream.overrun for stream in self._streams.values()),
-            unpaired=sum(self._pairer.unpaired.values()),
-            incomplete=self._pairer.incomplete,
-            without_orientation=self._without_orientation,
-        )
 
     def _values(self) -> dict[str, object]:
         rig = self._rigs.newest

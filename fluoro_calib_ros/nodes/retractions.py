@@ -124,13 +124,10 @@ class BodyRetractions:
 
 def _unknown_pose(poses: BodyPoses) -> BodyPoses:
     """Return the same exposures with unknown poses."""
+    numbers = ('rotation', 'position_mm', 'covariance_noise', 'covariance_fixed', 'rig_root')
     return replace(
         poses,
-        rotation=np.full_like(poses.rotation, np.nan),
-        position_mm=np.full_like(poses.position_mm, np.nan),
-        covariance_noise=np.full_like(poses.covariance_noise, np.nan),
-        covariance_fixed=np.full_like(poses.covariance_fixed, np.nan),
-        rig_root=np.full_like(poses.rig_root, np.nan),
+        **{name: np.full_like(getattr(poses, name), np.nan) for name in numbers},
         markers=np.zeros_like(poses.markers),
         status=np.full_like(poses.status, PoseStatus.FAILED),
     )

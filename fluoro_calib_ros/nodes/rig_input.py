@@ -238,8 +238,13 @@ class BodyParameters:
             raise ValueError('joints: the parameter bodies, which they are between, is not set')
 
 
-def read_body_files(parameters: BodyParameters) -> tuple[tuple[Body, ...], tuple[JointEntry, ...]]:
-    """Return the bodies and joints of files. Raises DataError that names the file."""
+def read_body_files(
+    parameters: BodyParameters, rig_frame: str = ''
+) -> tuple[tuple[Body, ...], tuple[JointEntry, ...]]:
+    """Return the bodies and joints of files. Raises DataError that names the file.
+
+    rig_frame: name of the parent frame, which no body can have.
+    """
     if not parameters.bodies:
         return (), ()
     path = expand_path(parameters.bodies)
@@ -251,6 +256,10 @@ def read_body_files(parameters: BodyParameters) -> tuple[tuple[Body, ...], tuple
                 raise DataError(
                     f'body {body.name!r}: a name in topics has letters, digits and _, and begins '
                     'with a letter'
+                )
+            if body.name == rig_frame:
+                raise DataError(
+                    f'body {body.name}: it is a frame in TF, whose parent rig_frame has this name'
                 )
     if not parameters.joints:
         return bodies, ()

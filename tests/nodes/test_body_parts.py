@@ -449,3 +449,15 @@ def test_a_missing_file_of_bodies_is_named_once(tmp_path):
     with pytest.raises(DataError) as refused:
         read_body_files(BodyParameters(bodies=str(path)))
     assert str(refused.value) == f'{path}: there is no such file'
+
+
+def test_a_body_is_not_named_as_its_parent_in_tf(tmp_path):
+    """Its transform would be that of a frame to itself, which tf2 refuses."""
+    path = tmp_path / 'bodies.csv'
+    rows = ('lab,1,0,0,0,0.1', 'lab,2,1,0,0,0.1', 'lab,3,0,1,0,0.1')
+    path.write_text('\n'.join(('body,marker,x,y,z,sd', *rows, '')))
+    parameters = BodyParameters(bodies=str(path))
+    assert read_body_files(parameters, 'rig')[0][0].name == 'lab'
+    with pytest.raises(DataError, match=r'body lab: .*rig_frame has this name') as refused:
+        read_body_files(parameters, 'lab')
+    assert str(path) in str(refused.value)

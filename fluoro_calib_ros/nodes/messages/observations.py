@@ -270,6 +270,11 @@ class CorrectedFrame(NamedTuple):
     correction_sd: NDArray[np.float64]
     status: np.ndarray  #: uint8, of any length
 
+    @property
+    def columns(self) -> tuple[np.ndarray, ...]:
+        """The arrays apart from the target ids."""
+        return self.u, self.v, self.sigma, self.correction_sd, self.status
+
 
 def decode_corrected_observations(data: bytes) -> CorrectedFrame:
     """Read a CorrectedObservations message from its bytes. Raises ValueError if damaged."""

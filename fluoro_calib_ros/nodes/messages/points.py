@@ -30,17 +30,7 @@ from .observations import (
 )
 
 _TERMS = [0, 1, 2, 4, 5, 8]  # indices into a flattened covariance: xx, xy, xz, yy, yz, zz
-_SYMMETRIC = (
-    'cov_xx',
-    'cov_xy',
-    'cov_xz',
-    'cov_xy',
-    'cov_yy',
-    'cov_yz',
-    'cov_xz',
-    'cov_yz',
-    'cov_zz',
-)
+_SYMMETRIC = ('xx', 'xy', 'xz', 'xy', 'yy', 'yz', 'xz', 'yz', 'zz')
 
 
 class PointsContent(NamedTuple):
@@ -82,7 +72,7 @@ def encode_reconstructed_points(content: PointsContent) -> bytes:
 
 def covariance_of(message: ReconstructedPoints) -> NDArray[np.float64]:
     """Return the covariance matrices (n, 3, 3) of a message [m^2]."""
-    columns = [np.asarray(getattr(message, name)) for name in _SYMMETRIC]
+    columns = [np.asarray(getattr(message, f'cov_{name}')) for name in _SYMMETRIC]
     return np.stack(columns, axis=1).reshape(-1, 3, 3)
 
 

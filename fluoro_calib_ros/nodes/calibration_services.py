@@ -39,8 +39,7 @@ from .messages.self_calibration import (
     fill_verdict,
     options_of_request,
 )
-from .runtime.parameters import check_timeout
-from .runtime.services import Cancelled, ServiceEntry, in_thread, wake, within
+from .runtime.services import Cancelled, ServiceEntry, check_timeout, in_thread, wake, within
 
 
 class _Capture:

@@ -36,8 +36,14 @@ from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.status import Collected
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
 from .runtime.lifecycle import Stream, StreamNode
-from .runtime.parameters import check_timeout
-from .runtime.services import Requests, ServiceEntry, Worker, telling_service, within
+from .runtime.services import (
+    Requests,
+    ServiceEntry,
+    Worker,
+    check_timeout,
+    telling_service,
+    within,
+)
 
 
 def _no_angle() -> None:

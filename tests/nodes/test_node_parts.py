@@ -34,8 +34,8 @@ from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
 )
 from fluoro_calib_ros.nodes.messages.image import ImageConverter
 from fluoro_calib_ros.nodes.runtime.diagnostics import Refused, one_line
-from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path, groups_of
-from fluoro_calib_ros.nodes.runtime.services import Requests
+from fluoro_calib_ros.nodes.runtime.parameters import expand_path, groups_of
+from fluoro_calib_ros.nodes.runtime.services import Requests, check_timeout
 
 SIZE = (64, 48)
 ROOT = Path(__file__).parents[2]

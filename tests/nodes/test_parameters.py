@@ -22,13 +22,12 @@ from fluoro_calib_ros.nodes.reconstruction_node import ReconstructionParameters
 from fluoro_calib_ros.nodes.runtime.diagnostics import StartError
 from fluoro_calib_ros.nodes.runtime.parameters import (
     MAX_INTEGER,
-    MAX_TIMEOUT_S,
     ParameterGroup,
     ParameterNode,
-    check_timeout,
     descriptor_of,
     parameters_of,
 )
+from fluoro_calib_ros.nodes.runtime.services import MAX_TIMEOUT_S, check_timeout
 from fluoro_calib_ros.options import declared, option
 from tools import write_tables
 from tools.sections import with_section

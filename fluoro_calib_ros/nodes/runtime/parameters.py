@@ -35,7 +35,6 @@ from ...limits import MAX_TEXT, ReadLimits, use_read_limits
 from ...options import Option, declared, option
 from .diagnostics import PrintableLogger, StartError
 
-MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
 MAX_INTEGER = 2**63 - 1  # largest integer parameter in ROS
 # A fluoroscope's name is part of file names and topics.
 FLUOROSCOPE_NAME = re.compile('[A-Za-z_][A-Za-z0-9_]{0,99}')
@@ -195,12 +194,7 @@ class ParameterGroup(Generic[T]):
         def options_with(parameters: Iterable[Parameter]) -> T:
             values = {name: node.get_parameter(name).value for name in declarations}
             values.update((p.name, p.value) for p in parameters)
-            return self._options_of(
-                {
-                    name: _tuple_or_value(declarations[name], value)
-                    for name, value in values.items()
-                }
-            )
+            return self._options_of(values)
 
         def check(parameters: Sequence[Parameter]) -> SetParametersResult:
             group_parameters = [p for p in parameters if p.name in declarations]
@@ -219,8 +213,10 @@ class ParameterGroup(Generic[T]):
 
     def _options_of(self, values: Mapping[str, Any]) -> T:
         """Return the options for parameter values. Raises ValueError."""
-        for parameter, declaration in self.declarations.items():
-            declaration.validate(values[parameter])
+        declarations = self.declarations
+        values = {name: _tuple_or_value(declarations[name], values[name]) for name in declarations}
+        for name, declaration in declarations.items():
+            declaration.validate(values[name])
         return self.options(**{name: values[parameter] for name, parameter in self._names.items()})
 
 
@@ -272,15 +268,12 @@ def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -
             given = Parameter(declaration.name, value=float(given.value))
             node._parameter_overrides[declaration.name] = given
         _check_given(declaration, given)
+    listed = list(default) if isinstance(default, tuple) else default
+    descriptor = descriptor_of(declaration, read_only)
     try:
-        value = node.declare_parameter(
-            declaration.name,
-            list(default) if isinstance(default, tuple) else default,
-            descriptor_of(declaration, read_only),
-        ).value
+        return node.declare_parameter(declaration.name, listed, descriptor).value
     except ParameterException as error:
         raise StartError(f'parameter {declaration.name}: {error}') from None
-    return _tuple_or_value(declaration, value)
 
 
 # Name of a value in messages, by the type of the default.
@@ -353,16 +346,12 @@ def unknown_parameters(node: Node) -> list[str]:
     ROS ignores such parameters: a mistyped name would silently have no effect. Parameters of other
     nodes of a rig are not reported, because a file may set them for all nodes (/**).
     """
-    sentences = []
-    rig_parameters: frozenset[str] | None = None
-    for name in node._parameter_overrides:  # rclpy has no public access to them
-        if node.has_parameter(name) or name.startswith(_OF_ROS):
-            continue
-        rig_parameters = _parameters_of_rig() if rig_parameters is None else rig_parameters
-        if name in rig_parameters:
-            continue
-        sentences.append(f'there is no parameter {name}, it has no effect{_hint(node, name)}')
-    return sentences
+    return [
+        f'there is no parameter {name}, it has no effect{_hint(node, name)}'
+        for name in node._parameter_overrides  # rclpy has no public access to them
+        if not (node.has_parameter(name) or name.startswith(_OF_ROS))
+        and name not in _parameters_of_rig()
+    ]
 
 
 def _hint(node: Node, name: str) -> str:
@@ -397,16 +386,7 @@ def check_fluoroscopes(names: tuple[str, ...], minimum: int = 1) -> None:
 def check_frame(name: str) -> None:
     """Raise ValueError for a name that tf2 does not accept for a frame."""
     if not name or name.startswith('/'):
-        raise ValueError(
-            f'rig_frame: {name!r} is no name of a frame in tf2: it is empty or begins with a /'
-        )
-
-
-def check_timeout(seconds: float) -> None:
-    """Raise ValueError for a time that a node cannot wait."""
-    if not 0 < seconds <= MAX_TIMEOUT_S:
-        limit = f', at most {MAX_TIMEOUT_S:g}' if seconds > MAX_TIMEOUT_S else ''
-        raise ValueError(f'timeout_sec must be a time in seconds{limit}, not {seconds}')
+        raise ValueError(f'rig_frame: {name!r} is no name of a frame: empty, or begins with a /')
 
 
 def expand_path(text: str) -> Path:

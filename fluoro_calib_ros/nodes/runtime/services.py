@@ -31,6 +31,7 @@ from .topics import services_qos
 # logs texts in a request unchanged, such as the label of a transition.
 
 Callback = Callable[[Any, Any], Any]
+MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
 
 
 def guard_services(node: Node, services: Iterable[Service]) -> None:
@@ -152,6 +153,13 @@ class Requests:
             yield
         finally:
             self.waiting -= 1
+
+
+def check_timeout(seconds: float) -> None:
+    """Raise ValueError for a time that a node cannot wait."""
+    if not 0 < seconds <= MAX_TIMEOUT_S:
+        limit = f', at most {MAX_TIMEOUT_S:g}' if seconds > MAX_TIMEOUT_S else ''
+        raise ValueError(f'timeout_sec must be a time in seconds{limit}, not {seconds}')
 
 
 async def within(

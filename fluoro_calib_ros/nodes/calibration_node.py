@@ -17,6 +17,7 @@ calibrate (calibration_services), heal (healing_services), and save and load
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache, partial
 
 from fluoro_calib_msgs.msg import DriftStatus, TargetObservations
@@ -46,7 +47,6 @@ from .exposure_input import (
 from .frame_validation import with_limit
 from .healing_services import Healing
 from .messages.observations import ObservedFrame, decode_target_observations
-from .messages.status import FluoroscopeProgress
 from .runtime.conditions import health_of, state_of
 from .runtime.diagnostics import RefusalLog, Status
 from .runtime.lifecycle import StreamNode, stream_faults
@@ -192,7 +192,13 @@ class CalibrationNode(StreamNode):
 
     def _diagnose(self, stream: PhantomStream) -> Status:
         name = stream.name
-        progress = self._progress_of(name)
+        progress = replace(
+            self._exposures.collected(name),
+            is_calibrating=name in self._calibrating.running,
+            last_round=self._calibrating.last_round.get(name),
+            calibration=self._output.calibrations.get(name),
+            calibration_age_s=self._output.age_s(name),
+        )
         self._output.publish_status(progress)
         state = state_of(
             FluoroscopeState,
@@ -200,7 +206,7 @@ class CalibrationNode(StreamNode):
             stream,
             [OBSERVATIONS],
             'target observations',
-            counts={'unpaired': progress.collected.unpaired},
+            counts={'unpaired': progress.unpaired},
             progress=progress,
             output=self._output,
             disagreement=self._exposures.disagreement(),
@@ -209,7 +215,7 @@ class CalibrationNode(StreamNode):
         orientation = self._output.orientation
         verdict = self._output.verdict(name)
         values = {
-            **progress.collected.values(),
+            **progress.values(),
             'calibration directory': self._rig.directory,
             'lost at the input': stream.overrun,
             'last fault': stream.refusals.last_fault,
@@ -221,16 +227,6 @@ class CalibrationNode(StreamNode):
             **self._angles.values(name),
         }
         return Status(name, *health_of(state, CONDITIONS), values)
-
-    def _progress_of(self, name: str) -> FluoroscopeProgress:
-        return FluoroscopeProgress(
-            fluoroscope=name,
-            collected=self._exposures.collected(name),
-            is_calibrating=name in self._calibrating.running,
-            last_round=self._calibrating.last_round.get(name),
-            calibration=self._output.calibrations.get(name),
-            calibration_age_s=self._output.age_s(name),
-        )
 
 
 main = partial(run, CalibrationNode)

@@ -23,7 +23,7 @@ from ..photogrammetry import rig_orientation
 from .messages.fluoroscope_calibration import message_from_calibration
 from .messages.image import colour_message
 from .messages.rig_orientation import message_from_orientation
-from .messages.status import FluoroscopeProgress, message_from_progress
+from .messages.status import Progress, message_from_progress
 from .runtime import conditions
 from .runtime.conditions import StreamState, fails, missing_publisher, warns
 from .runtime.diagnostics import OK, Health
@@ -109,20 +109,19 @@ class CalibrationOutput:
         """Return how long a calibration has been in use [s], NaN if there is none."""
         return time.monotonic() - self._since.get(name, float('nan'))
 
-    def publish_status(self, progress: FluoroscopeProgress) -> None:
+    def publish_status(self, progress: Progress) -> None:
         """Publish the progress of a fluoroscope, and a coverage picture if it has subscribers."""
         stamp = self._node.get_clock().now().to_msg()
         name = progress.fluoroscope
         self._status[name].publish(message_from_progress(progress, stamp))
-        collected = progress.collected
-        if collected.covered is None or not self._coverage[name].get_subscription_count():
+        if progress.covered is None or not self._coverage[name].get_subscription_count():
             return
         lines = (
-            f'{name}: {collected.exposures} exposures, {100 * collected.coverage:.0f} % covered',
-            collected.readiness.advice,
+            f'{name}: {progress.exposures} exposures, {100 * progress.coverage:.0f} % covered',
+            progress.readiness.advice,
         )
-        size = collected.image_size or (1, 1)
-        picture = coverage_picture(collected.covered, size, lines, collected.readiness.areas)
+        size = progress.image_size or (1, 1)
+        picture = coverage_picture(progress.covered, size, lines, progress.readiness.areas)
         self._coverage[name].publish(colour_message(picture, stamp, f'{name}_optical'))
 
 
@@ -130,7 +129,7 @@ class CalibrationOutput:
 class FluoroscopeState(StreamState):
     """State from which the health of a fluoroscope is diagnosed."""
 
-    progress: FluoroscopeProgress
+    progress: Progress
     output: CalibrationOutput
     disagreement: str  #: message if stamps show that pairs may be wrong, else ''
     angle: Health | None  #: warning if the angle of the C-arm is unknown

@@ -33,7 +33,7 @@ from .calibration_settings import (
     RigSetup,
 )
 from .messages.observations import ObservedFrame, frame_from_observed
-from .messages.status import Collected
+from .messages.status import Progress
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
 from .runtime.lifecycle import Stream, StreamNode
 from .runtime.services import (
@@ -145,13 +145,14 @@ class ExposureInput:
         with self._lock:
             return self._radiographs.of(frames)
 
-    def collected(self, name: str) -> Collected:
+    def collected(self, name: str) -> Progress:
         """Return a summary of the data collected for a fluoroscope."""
         stream = self.streams[name]
         with self._lock:
             exposures = self._collector.exposures
             coverage = self._collector.coverage.get(name)
-            return Collected(
+            return Progress(
+                fluoroscope=name,
                 received=stream.received,
                 rejected=stream.refusals.total + stream.refusals.failures,
                 unpaired=self._pairer.unpaired[name],

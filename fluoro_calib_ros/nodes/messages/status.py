@@ -52,9 +52,10 @@ def message_from_drift_state(
 
 
 @dataclass(frozen=True)
-class Collected:
-    """Summary of the data collected for one fluoroscope."""
+class Progress:
+    """Data collected for one fluoroscope, and the progress of its calibration."""
 
+    fluoroscope: str
     #: numbers of frames
     received: int
     rejected: int
@@ -67,6 +68,15 @@ class Collected:
     covered: NDArray[np.bool_] | None
     image_size: tuple[int, int] | None
     readiness: Readiness
+    is_calibrating: bool = False
+    last_round: Round | None = None  #: last round of the running or last self-calibration
+    calibration: FluoroscopeCalibration | None = None
+    calibration_age_s: float = math.nan
+
+    @property
+    def calibration_id(self) -> str:
+        """Id of the calibration, '' if there is none."""
+        return self.calibration.calibration_id if self.calibration else ''
 
     def values(self) -> dict[str, object]:
         """Return the values for the diagnostics."""
@@ -81,24 +91,7 @@ class Collected:
         }
 
 
-@dataclass(frozen=True)
-class FluoroscopeProgress:
-    """State of one fluoroscope in the calibration node."""
-
-    fluoroscope: str
-    collected: Collected
-    is_calibrating: bool = False
-    last_round: Round | None = None  #: last round of the running or last self-calibration
-    calibration: FluoroscopeCalibration | None = None
-    calibration_age_s: float = math.nan
-
-    @property
-    def calibration_id(self) -> str:
-        """Id of the calibration, '' if there is none."""
-        return self.calibration.calibration_id if self.calibration else ''
-
-
-def message_from_progress(progress: FluoroscopeProgress, stamp: Time) -> CalibrationStatus:
+def message_from_progress(progress: Progress, stamp: Time) -> CalibrationStatus:
     """Return the message of the progress of one fluoroscope."""
     state = CalibrationStatus.COLLECTING
     if progress.is_calibrating:
@@ -108,12 +101,12 @@ def message_from_progress(progress: FluoroscopeProgress, stamp: Time) -> Calibra
     message = CalibrationStatus(
         fluoroscope=progress.fluoroscope,
         state=state,
-        frames_received=progress.collected.received,
-        frames_rejected=progress.collected.rejected,
-        frames_unpaired=progress.collected.unpaired,
-        exposures=progress.collected.exposures,
-        observations=progress.collected.observations,
-        coverage=progress.collected.coverage,
+        frames_received=progress.received,
+        frames_rejected=progress.rejected,
+        frames_unpaired=progress.unpaired,
+        exposures=progress.exposures,
+        observations=progress.observations,
+        coverage=progress.coverage,
         calibration_age=progress.calibration_age_s,
         calibration_id=progress.calibration_id,
     )

@@ -174,9 +174,9 @@ CONDITIONS = (
     # Nobody publishes frames, or has ever done so.
     warns(lambda state: '' if state.stream.received else missing_publisher(state)),
     conditions.overrun_input,
+    warns(lambda state: state.disagreement),
     conditions.unpaired_frames,
     conditions.refused_messages,
-    warns(lambda state: state.disagreement),
     lambda state: state.angle,
     warns(_failed_verdict),
     working,

@@ -170,6 +170,25 @@ def test_a_damaged_calibration_is_named_until_another_one_is_in_use():
     assert health_of(state, correcting_node.CONDITIONS).message == 'no publisher of observations'
 
 
+def test_the_calibration_node_tells_why_frames_have_no_partner_first():
+    state = SimpleNamespace(
+        node=SimpleNamespace(readers=['active'], incompatible={}, resolve_topic_name=str),
+        topics=('a/target_observations',),
+        refusals=refusals(),
+        recent=Counter(unpaired=7),
+        stream=SimpleNamespace(name='a', received=9),
+        output=SimpleNamespace(load_fault='', save_fault='', refused={}),
+        progress=SimpleNamespace(calibration_id=''),
+        disagreement='frames of a are not numbered',
+    )
+    state.node.get_publishers_info_by_topic = lambda topic: ()
+    found = health_of(state, calibration_output.CONDITIONS)
+    assert found == (WARN, 'frames of a are not numbered')
+    state.disagreement = ''
+    found = health_of(state, calibration_output.CONDITIONS)
+    assert found.message.startswith('7 frames without partner')
+
+
 def test_faults_are_counted_in_the_stream_of_their_topic():
     streams = {name: Stream(name, refusals()) for name in 'ab'}
     faults = stream_faults(streams, print)

@@ -12,7 +12,12 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from fluoro_calib_ros.nodes.runtime.main import _description, asks_for_help, help_text
+from fluoro_calib_ros.nodes.runtime.main import (
+    _description,
+    asks_for_help,
+    help_text,
+    unused_arguments,
+)
 from fluoro_calib_ros.nodes.runtime.parameters import parameters_of, unknown_parameters
 from fluoro_calib_ros.options import Option
 
@@ -89,3 +94,15 @@ def test_help_has_the_name_that_is_typed(name, shown):
     module.__spec__ = ModuleSpec('fluoro_calib_ros.nodes.other_node', None)
     module.PARAMETERS = ()
     assert help_text(module).split()[:2] == ['usage:', shown]
+
+
+def test_arguments_that_are_not_of_ros_are_told():
+    """Without --ros-args, parameters would silently have no effect."""
+    (told,) = unused_arguments(['-p', 'phantom:=x.csv', '--ros-args', '-r', '__ns:=/rig'])
+    assert told == (
+        'arguments without effect: -p phantom:=x.csv; parameters and names follow --ros-args'
+    )
+    assert unused_arguments(['--ros-args', '-p', 'phantom:=x.csv']) == []
+    assert unused_arguments([]) == []
+    (told,) = unused_arguments(['\n' * 10_000])
+    assert told.isprintable() and len(told) < 2000

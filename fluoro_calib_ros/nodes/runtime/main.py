@@ -28,8 +28,9 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
-from ...errors import DataError
+from ...errors import DataError, printable, shortened
 from ...io.access import check_regular_file
 from ...options import Option
 from .diagnostics import USER_ERRORS, StartError, log_line, one_line
@@ -54,7 +55,8 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
     whereas rclpy's own signal handlers would shut it down while they run. A node that has not
     ended within its time (END_S) after a signal is ended with exit status 1 and a sentence.
     """
-    if asks_for_help(sys.argv[1:] if args is None else args):
+    words = sys.argv[1:] if args is None else args
+    if asks_for_help(words):
         print(help_text(sys.modules[make_node.__module__]))
         sys.exit(0)
     ended = threading.Event()
@@ -75,7 +77,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
         _call_on_interrupt(end, lambda: getattr(node, 'end_s', END_S))
         node = _make(make_node)
         executor.add_node(node)
-        for sentence in unknown_parameters(node):
+        for sentence in (*unknown_parameters(node), *unused_arguments(words)):
             node.get_logger().warning(sentence)
         guard_services(node, node.services)
         getattr(node, 'bring_up', lambda: None)()
@@ -197,6 +199,13 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def unused_arguments(words: Sequence[str]) -> list[str]:
+    """Return a sentence if some arguments have no effect, because they are not of ROS."""
+    unused = ' '.join(remove_ros_args(['', *words])[1:])
+    text = f'arguments without effect: {printable(shortened(unused))}; parameters and names follow'
+    return [f'{text} --ros-args'] if unused else []
 
 
 # Output of a node for --help: its task, how to start it, and its parameters.

@@ -75,13 +75,12 @@ class Admission:
         headers = {name.strip().lower(): value.strip() for name, _, value in fields}
         if len(words) != 3 or words[0] != 'GET':
             return 'this is not a WebSocket request'
+        token = ''
         with suppress(ValueError):
             token = parse_qs(urlsplit(words[1]).query).get('token', [''])[0]
-            if hmac.compare_digest(token.encode(), self.token.encode()):
-                return self._refusal_of_origin(headers.get('origin', ''))
-        return 'the token is missing or wrong'
-
-    def _refusal_of_origin(self, origin: str) -> str:
+        if not hmac.compare_digest(token.encode(), self.token.encode()):
+            return 'the token is missing or wrong'
+        origin = headers.get('origin', '')
         is_page = origin == 'null' or origin.lower().startswith(('http:', 'https:'))
         return 'its Origin is not allowed' if is_page and origin not in self.origins else ''
 

@@ -19,9 +19,8 @@ from .calibration_input import CalibrationInput
 from .runtime import conditions
 from .runtime.conditions import StreamState, health_of, healthy, state_of, warns
 from .runtime.diagnostics import WARN, Health, RefusalLog, Status, one_line
-from .runtime.lifecycle import Stream, StreamNode, stream_faults
+from .runtime.lifecycle import Stream, StreamNode
 from .runtime.parameters import ParameterGroup, declare_read_limits, expand_path
-from .runtime.streams import FaultHandlers
 
 FILES = f'*{SUFFIX}'
 ANGLES = ParameterGroup(AngleOptions)
@@ -182,11 +181,6 @@ class CorrectingNode(StreamNode):
             self.get_logger().warning(printable(str(disagreement)))
         for name in self.names:
             self._calibrations.begin_with(name, loaded[name])
-
-    @property
-    def fault_handlers(self) -> FaultHandlers:
-        """Handlers that a stream reader calls when something goes wrong."""
-        return stream_faults(self.streams, self.fail)
 
     def diagnose(self) -> list[Status]:
         """Return the status of every fluoroscope."""

@@ -29,6 +29,7 @@ from .messages.observations import (
     encode_corrected_observations,
 )
 from .runtime.diagnostics import Refused
+from .runtime.lifecycle import stream_faults
 from .runtime.main import run
 from .runtime.parameters import READ_LIMITS, CalibratedParameters, ParameterGroup
 from .runtime.topics import latched_qos, observations_qos
@@ -80,7 +81,7 @@ class CorrectionNode(CorrectingNode):
     def create_readers(self) -> None:
         """Receive the observations of all fluoroscopes in one thread."""
         angles = self.angles[self.names[0]]  # the same for all fluoroscopes
-        reader = angles.create_reader(self, self.fault_handlers)
+        reader = angles.create_reader(self, stream_faults(self.streams, self.fail))
         for name in self.names:
             reader.subscribe(
                 TargetObservations,

@@ -46,10 +46,6 @@ from .runtime.services import (
 )
 
 
-def _no_angle() -> None:
-    """Return None: the angle is unknown."""
-
-
 @dataclass
 class PhantomStream(Stream):
     """Stream of a fluoroscope that is searched for the phantom."""
@@ -195,7 +191,7 @@ class ExposureInput:
     # -- the thread of the streams
 
     def add(
-        self, name: str, observed: ObservedFrame, angle: Callable[[], float | None] = _no_angle
+        self, name: str, observed: ObservedFrame, angle: Callable[[], float | None] = lambda: None
     ) -> None:
         """Process a frame: ignore it, refuse it, or validate, pair and possibly collect it.
 
@@ -258,7 +254,12 @@ class ExposureInput:
         self._on_pair(pair)
         collector = self._collector
         if len(collector.exposures) >= self._settings.limits.max_exposures:
-            self._refuse_full(len(collector.exposures))
+            # Each new exposure is compared with all others.
+            self.capture_refusal = (
+                f'{len(collector.exposures)} exposures are collected, as many as max_exposures '
+                'allows: reset first'
+            )
+            self._limited_logger.warning(self.capture_refusal)
             return
         if self._captures:
             refusal = self.capture_refusal = collector.add(pair)
@@ -284,13 +285,6 @@ class ExposureInput:
         if not refusal:
             self._radiographs.want(collector.exposures)
             self._log_collected(pair)
-
-    def _refuse_full(self, exposures: int) -> None:
-        """Refuse further exposures, because each new one is compared with all others."""
-        self.capture_refusal = (
-            f'{exposures} exposures are collected, as many as max_exposures allows: reset first'
-        )
-        self._limited_logger.warning(self.capture_refusal)
 
     def _log_collected(self, pair: Mapping[str, Frame]) -> None:
         counts = ', '.join(

@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 from fluoro_calib_msgs.msg import Retraction, TargetObservations
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Header
 
 from ..bodies.body import Body, declared_bodies
 from ..errors import DataError
@@ -265,7 +264,12 @@ class ExtractionNode(StreamNode):
         size = self._settings.node.queue_size
         # Leave room for images that wait for the other views.
         size = max(size, LATE + 1) if self._calibrations else size
-        return ExtractionWorkers(self.streams, size, self._is_overlay_wanted, self._finish)
+        return ExtractionWorkers(
+            self.streams,
+            size,
+            wanted=lambda name: bool(self._overlays[name].get_subscription_count()),
+            finish=self._finish,
+        )
 
     # -- lifecycle
 
@@ -306,18 +310,12 @@ class ExtractionNode(StreamNode):
         self.streams[name].received += 1
         stamp_ns = nanoseconds_from_stamp(message.header.stamp)
         number = self._numbers.number(name, stamp_ns)
-        angle = self._angles.of_frame(name, stamp_ns, needed=self._needs_angle(name))
+        calibration = self._calibrations.get(name)
+        needed = calibration is not None and calibration.angle_field is not None  # to predict
+        angle = self._angles.of_frame(name, stamp_ns, needed)
         self._workers.put(name, Task(number, message, info['received_timestamp'], angle))
 
-    def _needs_angle(self, name: str) -> bool:
-        """Return whether predictions in the images of a fluoroscope depend on its angle."""
-        calibration = self._calibrations.get(name)
-        return calibration is not None and calibration.angle_field is not None
-
     # -- the threads that extract
-
-    def _is_overlay_wanted(self, name: str) -> bool:
-        return bool(self._overlays[name].get_subscription_count())
 
     def _finish(
         self, stream: ImageStream, task: Task, image: np.ndarray, observed: Observations
@@ -325,7 +323,10 @@ class ExtractionNode(StreamNode):
         """Publish the targets found in an image, and count it."""
         header = task.message.header
         if not observed.reason:
-            self._publish_radiograph(stream.name, header, image)
+            radiographs = self._radiographs[stream.name]
+            if self._settings.node.mode == 'phantom' and radiographs.get_subscription_count():
+                jpeg = array('B', small_jpeg(image, RADIOGRAPH_PX))
+                radiographs.publish(CompressedImage(header=header, format='jpeg', data=jpeg))
             frame = Frame(
                 stream.name,
                 task.number,
@@ -344,13 +345,6 @@ class ExtractionNode(StreamNode):
             self._overlays[stream.name].publish(
                 message_from_image(header, np.ascontiguousarray(observed.picture))
             )
-
-    def _publish_radiograph(self, name: str, header: Header, image: np.ndarray) -> None:
-        """Publish a small copy of an image that shows the phantom, if there are subscribers."""
-        publisher = self._radiographs[name]
-        if self._settings.node.mode == 'phantom' and publisher.get_subscription_count():
-            jpeg = array('B', small_jpeg(image, RADIOGRAPH_PX))
-            publisher.publish(CompressedImage(header=header, format='jpeg', data=jpeg))
 
     def _retract(self, stream: ImageStream, task: Task, observed: Observations) -> None:
         """Publish which ids of earlier images are retracted."""

@@ -33,6 +33,7 @@ from .messages.image import (
     use_single_thread,
 )
 from .runtime.diagnostics import Refused
+from .runtime.lifecycle import stream_faults
 from .runtime.main import run
 from .runtime.parameters import READ_LIMITS, CalibratedParameters, ParameterGroup
 from .runtime.topics import images_qos, latched_qos
@@ -129,7 +130,7 @@ class ImageNode(CorrectingNode):
     def create_readers(self) -> None:
         """Receive the images of each fluoroscope in its own thread."""
         for name, angles in self.angles.items():
-            reader = angles.create_reader(self, self.fault_handlers)
+            reader = angles.create_reader(self, stream_faults(self.streams, self.fail))
             for kind, topic in self._inputs:
                 reader.subscribe(
                     kind,

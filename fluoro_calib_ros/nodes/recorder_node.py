@@ -100,7 +100,7 @@ class RecorderNode(ParameterNode):
                 lambda topic: self._limited_logger.error(f'{topic}: a message cannot be taken'),
                 lambda topic, error: self._limited_logger.error(f'{topic}: {error!r}'),
                 self.fail,
-                overrun=self._on_overrun,
+                overrun=lambda topic, count: self._overrun.update({topic: count}),
             ),
             received_by_all,
         )
@@ -156,9 +156,6 @@ class RecorderNode(ParameterNode):
         dropped = lost_text(self._recording.dropped)
         cause = self._recording.fault or 'the disk is too slow'
         return f'messages are dropped, {cause}: {dropped}' if dropped else ''
-
-    def _on_overrun(self, topic: str, count: int) -> None:
-        self._overrun[topic] += count
 
     def _lost_at_input(self) -> str:
         """Return a message about messages lost at the input, '' if none was lost."""

@@ -149,7 +149,9 @@ class RigInput:
             self._refusals.last_fault = str(error)
             self._logger.error(f'orientation refused, the current one stays in use: {error}')
             return False
-        self._log_jump(orientation)
+        jump = '' if self.newest is None else jump_text(self.newest.orientation, orientation)
+        if jump:
+            self._logger.warning(f'the transforms of the rig jump: {jump}')
         newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
         self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
         self._logger.info(f'{description_of(message)}, in use')
@@ -161,14 +163,6 @@ class RigInput:
             self._calibrated = orientation_from_message(message).subset(self._names)
         except ValueError as error:  # DataError among them
             self._logger.error(f'orientation as calibrated refused: {error}')
-
-    def _log_jump(self, orientation: rig_orientation.RigOrientation) -> None:
-        """Log how far the transforms of the rig jump with a new orientation."""
-        if self.newest is None:
-            return
-        jump = jump_text(self.newest.orientation, orientation)
-        if jump:
-            self._logger.warning(f'the transforms of the rig jump: {jump}')
 
     def saved(self, file: str, folder: str) -> RigOrientation | None:
         """Return the orientation of a file, else of a folder, or None if there is none."""

@@ -65,15 +65,16 @@ class ImageConverter:
 
         The array shares the memory of an Image if byte order and row step allow. Raises Refused.
         """
-        if isinstance(message, CompressedImage):
-            image = self._decompress(message)
-            return image, ENCODINGS[image.dtype]
+        is_compressed = isinstance(message, CompressedImage)
         try:
-            return raw_image(message), message.encoding
+            image = decode(message.data) if is_compressed else raw_image(message)
         except DataError as error:
-            is_encoding = error.finding.kind is Kind.IMAGE_ENCODING
-            kind = 'encoding' if is_encoding else 'image size'
-            raise self.refusal(kind, message, str(error)) from None
+            kind = 'damaged' if is_compressed else 'image size'
+            if error.finding.kind is Kind.IMAGE_ENCODING:
+                kind = 'encoding'
+            prefix = f'{message.format or "no format"}: ' if is_compressed else ''
+            raise self.refusal(kind, message, f'{prefix}{error}') from None
+        return image, ENCODINGS[image.dtype] if is_compressed else message.encoding
 
     def prepare_output(
         self, header: Header, encoding: str, shape: tuple[int, ...]
@@ -94,16 +95,6 @@ class ImageConverter:
             self._output = {(encoding, shape): prepared}  # a stream has one encoding
         prepared[0].header = header
         return prepared
-
-    def _decompress(self, message: CompressedImage) -> np.ndarray:
-        try:
-            return decode(message.data)
-        except DataError as error:
-            is_encoding = error.finding.kind is Kind.IMAGE_ENCODING
-            kind = 'encoding' if is_encoding else 'damaged'
-            raise self.refusal(
-                kind, message, f'{message.format or "no format"}: {error}'
-            ) from None
 
     def refusal(self, kind: str, message: Image | CompressedImage, reason: str) -> Refused:
         """Return an error that identifies an image and says why it is refused."""

@@ -121,7 +121,15 @@ def fill_healing(result: Heal.Result, outcome: HealingOutcome, parent: RigOrient
     result.exposures = outcome.exposures
     result.place_sd_mm = float(outcome.after.place_mm)
     result.scale_sd = float(outcome.after.scale)
-    _fill_changes(result, outcome)
+    healed = outcome.healed
+    if healed is not None:
+        result.orientation_id = outcome.orientation.orientation_id
+        for f, name in enumerate(outcome.orientation.fluoroscopes):
+            if healed.changes[f].any() or f in healed.drift:  # changed fluoroscopes only
+                result.fluoroscope = [*result.fluoroscope, name]
+                result.distortion = [*result.distortion, f in healed.drift]
+                result.change = [*result.change, *healed.changes[f].tolist()]
+                result.sd = [*result.sd, *healed.sd[f].tolist()]
     statements = list(result.findings)
     if outcome.changed_meanwhile:
         statements.insert(0, CHANGED_MEANWHILE)
@@ -140,18 +148,3 @@ def healing_text(feedback: Heal.Feedback) -> str:
     if feedback.stage == 'collecting':
         return f'healing: {feedback.frames} frames of markers'
     return f'healing: diagnosis, step {feedback.step} of {feedback.steps}'
-
-
-def _fill_changes(result: Heal.Result, outcome: HealingOutcome) -> None:
-    """Fill in the changes, for the changed fluoroscopes only."""
-    healed = outcome.healed
-    if healed is None:
-        return
-    result.orientation_id = outcome.orientation.orientation_id
-    for f, name in enumerate(outcome.orientation.fluoroscopes):
-        if not healed.changes[f].any() and f not in healed.drift:
-            continue
-        result.fluoroscope = [*result.fluoroscope, name]
-        result.distortion = [*result.distortion, f in healed.drift]
-        result.change = [*result.change, *healed.changes[f].tolist()]
-        result.sd = [*result.sd, *healed.sd[f].tolist()]

@@ -164,7 +164,7 @@ class CalibrationInput:
         """Prepare a calibration in a thread."""
         with self._lock:
             self._next[name] = message
-            if self._thread is None:
+            if self._thread is None or not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._work, daemon=True)
                 self._thread.start()
 

@@ -218,6 +218,27 @@ def test_calibration_that_comes_while_the_thread_before_it_ends_is_prepared(cali
     assert inbox.ended.acquire(timeout=60) and len(inbox.taken) == 1
 
 
+def test_calibration_is_prepared_after_one_whose_use_failed(calibration, monkeypatch):
+    """Such as by a publisher that cannot publish: the thread has ended with it."""
+    inbox = Inbox()
+    inbox.go.set()
+    monkeypatch.setattr(threading, 'excepthook', lambda _: None)
+    fail = threading.Event()
+
+    def on_ready(name, kept):
+        if not fail.is_set():
+            fail.set()
+            raise RuntimeError('cannot publish')
+        inbox._take(name, kept)
+
+    inbox.calibrations._on_ready = on_ready
+    inbox.put(message_from_calibration(replace(calibration, stamp_ns=1)))
+    assert fail.wait(60)
+    inbox.calibrations._thread.join(60)
+    inbox.put(message_from_calibration(replace(calibration, stamp_ns=2)))
+    assert inbox.ended.acquire(timeout=60) and inbox.taken == [2]
+
+
 def test_closing_does_not_wait_for_a_calibration_and_it_is_not_used(calibration):
     inbox = Inbox()
     inbox.put(message_from_calibration(calibration))

@@ -81,10 +81,8 @@ def _with_corrections(
 ) -> TFMessage:
     """Return the transforms of a healed orientation, with frames at the calibrated poses."""
     out = transforms_of_orientation(message, rig_frame)
-    before = message_from_orientation(calibrated)
-    earlier = {
-        tf.child_frame_id: tf for tf in transforms_of_orientation(before, rig_frame).transforms
-    }
+    before = transforms_of_orientation(message_from_orientation(calibrated), rig_frame)
+    earlier = {tf.child_frame_id: tf for tf in before.transforms}
     moved = rig_change(calibrated, content_of_orientation(message))
     for healed in list(out.transforms):
         child = healed.child_frame_id
@@ -94,7 +92,13 @@ def _with_corrections(
         old.child_frame_id = healed.header.frame_id = f'{child}{AS_CALIBRATED}'
         out.transforms.append(old)
         (p0, r0), (p1, r1) = (_pose_of(tf) for tf in (old, healed))
-        _set_pose(healed, r0.T @ (p1 - p0), r0.T @ r1)
+        place, turn = r0.T @ (p1 - p0), quaternion_from_matrix(r0.T @ r1)
+        for target, names, values in (
+            (healed.transform.translation, 'xyz', place),
+            (healed.transform.rotation, 'wxyz', turn),
+        ):
+            for name, value in zip(names, values.tolist()):
+                setattr(target, name, value)
     return out
 
 
@@ -111,16 +115,6 @@ def _pose_of(stamped: TransformStamped) -> tuple[NDArray[np.float64], NDArray[np
     place, turn = stamped.transform.translation, stamped.transform.rotation
     rotation = matrix_from_quaternion(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]
     return np.array([place.x, place.y, place.z]), rotation
-
-
-def _set_pose(
-    stamped: TransformStamped, place: NDArray[np.float64], rotation: NDArray[np.float64]
-) -> None:
-    turn = quaternion_from_matrix(rotation)
-    for name, value in zip('xyz', place):
-        setattr(stamped.transform.translation, name, float(value))
-    for name, value in zip('wxyz', turn):
-        setattr(stamped.transform.rotation, name, float(value))
 
 
 _INTERIOR = ('xp', 'yp', 'c')
@@ -191,17 +185,15 @@ def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
                 f'{rig.MAX_VALUE:g}'
             )
     scale = _metre_scale(count)
-    covariance = np.array(message.covariance).reshape(len(scale), -1) / (scale * scale[:, None])
     attitude = np.stack([columns[name] for name in _ATTITUDE], axis=1)
-    norm = np.linalg.norm(attitude, axis=1)
-    if not (np.abs(norm - 1) <= ROTATION_TOLERANCE).all():
+    if not (np.abs(np.linalg.norm(attitude, axis=1) - 1) <= ROTATION_TOLERANCE).all():
         raise DataError('rig orientation: an attitude is not a unit quaternion')
     return rig.RigOrientation(
         fluoroscopes=tuple(message.fluoroscope),
         interior=np.stack([columns[name] for name in _INTERIOR], axis=1),
         rotation=matrix_from_quaternion(attitude).transpose(0, 2, 1),
         position_mm=1000 * np.stack([columns[name] for name in _POSITION], axis=1),
-        covariance=covariance,
+        covariance=np.array(message.covariance).reshape(len(scale), -1) / np.outer(scale, scale),
         frame_id=message.header.frame_id,
         source=message.source,
         calibration_ids=tuple(message.calibration_id),

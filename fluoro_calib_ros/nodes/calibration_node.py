@@ -26,7 +26,6 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
 from sensor_msgs.msg import CompressedImage
 
-from ..exposures.frame import Frame
 from ..exposures.stamps import nanoseconds_from_stamp
 from .angle_input import AngleInput
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
@@ -82,7 +81,6 @@ class CalibrationNode(StreamNode):
             names,
             self._rig.phantom,
             self._settings,
-            on_pair=self._on_pair,
             on_captured=partial(wake, self),
             logger=self.get_logger(),
         )
@@ -179,9 +177,6 @@ class CalibrationNode(StreamNode):
         self._exposures.add(name, frame, angle)
         self._healing.add(name, frame, angle)
         self._learning.add(name, frame, angle)
-
-    def _on_pair(self, pair: Mapping[str, Frame]) -> None:
-        self._orienting.add(pair)
 
     # -- diagnostics
 

@@ -5,9 +5,8 @@
 
 from __future__ import annotations
 
-import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -39,31 +38,7 @@ from .messages.self_calibration import (
     fill_verdict,
     options_of_request,
 )
-from .runtime.services import Cancelled, ServiceEntry, check_timeout, in_thread, wake, within
-
-
-class _Capture:
-    """Collects frames of the phantom in the rig frame until there are enough or time is up."""
-
-    def __init__(self, names: Sequence[str], count: int) -> None:
-        self.frames: dict[str, list[Frame]] = {name: [] for name in names}
-        self.done = Future()  # result: whether there are enough
-        self._count = count
-        self._lock = threading.Lock()
-
-    def add(self, pair: Mapping[str, Frame]) -> bool:
-        """Add a frame of every fluoroscope; return whether the capture has ended."""
-        for name, frame in pair.items():
-            self.frames[name].append(frame)
-        if len(self.frames[frame.fluoroscope]) == self._count:
-            self.finish(True)
-        return self.done.done()
-
-    def finish(self, is_complete: bool) -> None:
-        """End the capture, once only: frames and timeout come from different threads."""
-        with self._lock:
-            if not self.done.done():
-                self.done.set_result(is_complete)
+from .runtime.services import Cancelled, ServiceEntry, check_timeout, in_thread, within
 
 
 class OrientationService(RigServices):
@@ -71,18 +46,8 @@ class OrientationService(RigServices):
 
     def __init__(self, parts: NodeParts) -> None:
         super().__init__(parts)
-        self._capture: _Capture | None = None
+        self._is_capturing = False
         self.services = (ServiceEntry('orient', Orient, self._on_orient),)
-
-    def add(self, pair: Mapping[str, Frame]) -> None:
-        """Give frames of the phantom to the waiting capture, if any.
-
-        Called in the thread of the streams.
-        """
-        capture = self._capture
-        if capture is not None and capture.add(pair):
-            self._capture = None
-            wake(self._node)
 
     async def _on_orient(
         self, request: Orient.Request, response: Orient.Response
@@ -145,15 +110,19 @@ class OrientationService(RigServices):
         self, names: Sequence[str], count: int, timeout_s: float
     ) -> dict[str, list[Frame]]:
         """Return the next frames of all fluoroscopes. Raises DataError if time runs out."""
-        if self._capture is not None:
+        if self._is_capturing:
             raise DataError('another capture is waiting for its frames')
-        capture = self._capture = _Capture(names, count)
-        if await within(self._node, timeout_s, capture.done, lambda: capture.finish(False)):
-            return capture.frames
-        self._capture = None
+        self._is_capturing = True
+        wait = self._exposures.next_pairs(count)
+        try:
+            await within(self._node, timeout_s, wait.done, lambda: self._exposures.give_up(wait))
+        finally:
+            self._is_capturing = False
+        if len(wait.pairs) == count:
+            return {name: [pair[name] for pair in wait.pairs] for name in names}
         raise DataError(
-            f'{len(capture.frames[names[0]])} of {count} frames of all fluoroscopes '
-            f'({", ".join(names)}) came within {timeout_s:g} s'
+            f'{len(wait.pairs)} of {count} frames of all fluoroscopes ({", ".join(names)}) came '
+            f'within {timeout_s:g} s'
         )
 
 

@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from fluoro_calib_msgs.srv import Capture, Reset
@@ -55,6 +54,16 @@ class PhantomStream(Stream):
     is_other_object_logged: bool = False
 
 
+@dataclass(eq=False)
+class PairWait:
+    """Wait for pairs of frames, which ends if there are enough or if it is given up."""
+
+    count: int
+    collected: bool = False  #: whether it is for pairs that become exposures
+    pairs: list[Mapping[str, Frame]] = field(default_factory=list)
+    done: Future = field(default_factory=Future)
+
+
 RADIOGRAPH = 'radiograph'
 
 
@@ -73,10 +82,8 @@ class ExposureInput:
     phantom : Phantom or None
         If None, frames are only counted.
     settings : CalibrationSettings
-    on_pair : callable
-        Called with every pair of frames of the phantom, in the thread of the streams.
     on_captured : callable
-        Called in that thread after the Future of a capture has received its result.
+        Called in the thread of the streams after a Future of frames has received its result.
     logger : Logger
         Logger of the node.
     """
@@ -86,14 +93,12 @@ class ExposureInput:
         names: Sequence[str],
         phantom: Phantom | None,
         settings: CalibrationSettings,
-        on_pair: Callable[[Mapping[str, Frame]], None],
         on_captured: Callable[[], None],
         logger: Logger,
     ) -> None:
         self._names = tuple(names)
         self._phantom = phantom
         self._settings = settings
-        self._on_pair = on_pair
         self._on_captured = on_captured
         self._logger = logger
         self._limited_logger = RateLimitedLogger(logger)
@@ -101,7 +106,7 @@ class ExposureInput:
             name: PhantomStream(name, RefusalLog('frame', self._limited_logger))
             for name in self._names
         }
-        self._captures: deque[Future] = deque()  # one per capture that waits for its pair
+        self._waits: list[PairWait] = []  # for the next pairs
         self.capture_refusal = ''  # why the last pair was not captured
         self._lock = threading.Lock()
         self._start()
@@ -169,24 +174,29 @@ class ExposureInput:
             finding = self._pairer.tolerance.finding()
             return finding.sentence if finding else self._pairer.stamps.disagreement()
 
-    def capture(self) -> Future:
-        """Collect the next pair, whatever the mode.
-
-        Returns a Future of the pair's frame number and the resulting number of exposures; its
-        result is None if the wait was given up.
-        """
-        future = Future()
+    def next_pairs(self, count: int = 1, collected: bool = False) -> PairWait:
+        """Wait for the next pairs; collected: only for those that it adds to the exposures."""
+        wait = PairWait(count, collected)
         with self._lock:
-            self.capture_refusal = ''
-            self._captures.append(future)
-        return future
+            self._waits.append(wait)
+            if collected:
+                self.capture_refusal = ''
+        return wait
 
-    def give_up(self, captured: Future) -> None:
-        """Stop waiting for a capture."""
+    def give_up(self, wait: PairWait) -> None:
+        """Stop waiting for pairs, unless they have come."""
         with self._lock:
-            if not captured.done():
-                self._captures.remove(captured)
-                captured.set_result(None)
+            if wait in self._waits:
+                self._waits.remove(wait)
+                wait.done.set_result(None)
+
+    def _give(self, pair: Mapping[str, Frame], wait: PairWait) -> None:
+        """Give a pair to a wait, which ends with its last one."""
+        wait.pairs.append(pair)
+        if len(wait.pairs) == wait.count:
+            self._waits.remove(wait)
+            wait.done.set_result(None)
+            self._on_captured()
 
     # -- the thread of the streams
 
@@ -245,13 +255,14 @@ class ExposureInput:
                 f'fluoroscope {stream.name}, frame {frame.number}: {len(frame.target_id)} targets '
                 f'are too few, {MIN_TARGETS_OF_EXPOSURE} are needed'
             )
-        if stream.image_size is None:
-            stream.image_size = frame.image_size
+        stream.image_size = stream.image_size or frame.image_size
         return frame
 
     def _collect(self, pair: Mapping[str, Frame]) -> None:
         """Collect a pair for the oldest capture, or because the phantom stands still."""
-        self._on_pair(pair)
+        captures = [wait for wait in self._waits if wait.collected]
+        for wait in [wait for wait in self._waits if not wait.collected]:
+            self._give(pair, wait)
         collector = self._collector
         if len(collector.exposures) >= self._settings.limits.max_exposures:
             # Each new exposure is compared with all others.
@@ -261,12 +272,10 @@ class ExposureInput:
             )
             self._limited_logger.warning(self.capture_refusal)
             return
-        if self._captures:
+        if captures:
             refusal = self.capture_refusal = collector.add(pair)
             if not refusal:
-                captured = pair[self._names[0]].number, len(collector.exposures)
-                self._captures.popleft().set_result(captured)
-                self._on_captured()
+                self._give(pair, captures[0])
         elif self._settings.node.collect == 'still':
             before = len(collector.exposures)
             refusal = collector.offer(pair)
@@ -276,10 +285,8 @@ class ExposureInput:
                     f'fluoroscope {first.fluoroscope}: {refusal}; use the service capture'
                 )
             if len(collector.exposures) < before:
-                self._logger.info(
-                    f'exposure {before} discarded: it is the first frame of a stream in which the '
-                    'phantom moves'
-                )
+                reason = 'it is the first frame of a stream in which the phantom moves'
+                self._logger.info(f'exposure {before} discarded: {reason}')
         else:
             return
         if not refusal:
@@ -294,11 +301,11 @@ class ExposureInput:
         )
         exposures = len(self._collector.exposures)
         self._logger.info(f'exposure {exposures} collected ({counts})')
-        advice = [
+        advice = '; '.join(
             f'{name}: {readiness(exposures, coverage).advice}'
             for name, coverage in self._collector.coverage.items()
-        ]
-        self._logger.info(f'next pose: {"; ".join(advice)}')
+        )
+        self._logger.info(f'next pose: {advice}')
 
 
 @dataclass(frozen=True)
@@ -349,20 +356,18 @@ class CollectServices(RigServices):
         except ValueError as error:  # including DataError
             response.message = str(error)
             return response
-        future = self._exposures.capture()
+        wait = self._exposures.next_pairs(collected=True)
         with self._requests.one():
-            capture = await within(
-                self._node, timeout, future, lambda: self._exposures.give_up(future)
-            )
-        response.success = capture is not None
-        if capture is not None:
-            number, response.exposures = capture
-            response.message = f'frame {number} captured, {response.exposures} exposures now'
+            await within(self._node, timeout, wait.done, lambda: self._exposures.give_up(wait))
+        names = self._rig.names
+        response.success = bool(wait.pairs)
+        response.exposures = self._exposures.collected(names[0]).exposures
+        if wait.pairs:
+            first = wait.pairs[0][names[0]]
+            response.message = f'frame {first.number} captured, {response.exposures} exposures now'
         else:
-            names = self._rig.names
             streams = self._exposures.streams.values()
             received = ', '.join(f'{stream.name} {stream.received}' for stream in streams)
-            response.exposures = self._exposures.collected(names[0]).exposures
             response.message = self._exposures.capture_refusal or (
                 f'no frame of all fluoroscopes ({", ".join(names)}) came within {timeout:g} s; '
                 f'frames received: {received}'

@@ -41,7 +41,7 @@ def exposures(logger):
         limits=SimpleNamespace(max_exposures=100),
     )
     phantom = rigs.rig().phantom
-    return ExposureInput('ab', phantom, settings, lambda pair: None, lambda: None, logger)
+    return ExposureInput('ab', phantom, settings, lambda: None, logger)
 
 
 def observed(name, number, stamp_s):
@@ -81,7 +81,27 @@ def test_frames_without_a_stamp_are_collected_only_by_a_capture_and_the_log_says
     assert exposures.collected('a').exposures == 0
     assert 'without a stamp' in exposures.streams['a'].refusals.last_fault
     assert 'use the service capture' in logger.lines[0]
-    captured = exposures.capture()
+    captured = exposures.next_pairs(collected=True)
     for name in 'ab':
         exposures.add(name, observed(name, 15, 0))
-    assert captured.result() == (15, 1)
+    assert captured.done.done() and captured.pairs[0]['a'].number == 15
+    assert exposures.collected('a').exposures == 1
+
+
+def test_a_wait_for_pairs_ends_with_its_last_pair_or_is_given_up(exposures):
+    """Also where nothing is collected, as without a stamp."""
+    wait, other = exposures.next_pairs(2), exposures.next_pairs(3)
+    for number in (1, 2):
+        assert not wait.done.done()
+        for name in 'ab':
+            exposures.add(name, observed(name, number, 0))
+    assert wait.done.done() and [pair['b'].number for pair in wait.pairs] == [1, 2]
+    assert not other.done.done() and len(other.pairs) == 2
+    captured = exposures.next_pairs(collected=True)
+    for given_up in (other, captured, wait):  # the last one is over
+        exposures.give_up(given_up)
+    assert other.done.done() and captured.done.done() and not captured.pairs
+    for name in 'ab':
+        exposures.add(name, observed(name, 3, 0))
+    assert len(wait.pairs) == len(other.pairs) == 2
+    assert exposures.collected('a').exposures == 0

@@ -245,7 +245,7 @@ def test_exposures_are_limited():
     exposures._settings = settings
     exposures._collector = SimpleNamespace(exposures=[])
     exposures._limited_logger = RateLimitedLogger(PrintableLogger(inner))
-    exposures._on_pair = lambda pair: None
+    exposures._waits = []
     exposures._collect({'a': frames['a'][0]})
     assert 'as many as max_exposures allows' in exposures.capture_refusal
     assert inner.lines == [exposures.capture_refusal]

@@ -36,7 +36,6 @@ from fluoro_calib_ros.nodes import (
 from fluoro_calib_ros.nodes.angle_input import AngleInput, beyond_text
 from fluoro_calib_ros.nodes.bridge_node import Admission
 from fluoro_calib_ros.nodes.calibration_node import CalibrationNode
-from fluoro_calib_ros.nodes.calibration_services import _Capture
 from fluoro_calib_ros.nodes.calibration_settings import check_folders
 from fluoro_calib_ros.nodes.dashboard import state as session_state
 from fluoro_calib_ros.nodes.dashboard import terminal
@@ -357,19 +356,6 @@ def test_nearest_calibrated_angle_is_round_the_circle():
 
 def frame(name, number=1):
     return replace(rigs.exposures()['a'][0], fluoroscope=name, number=number)
-
-
-def test_capture_ends_with_its_last_frame():
-    capture = _Capture('ab', 2)
-    assert not capture.add({name: frame(name, 1) for name in 'ab'}) and not capture.done.done()
-    assert capture.add({name: frame(name, 2) for name in 'ab'})
-    assert capture.done.result() is True
-    assert [f.number for f in capture.frames['b']] == [1, 2]
-    capture.finish(False)
-    assert capture.done.result() is True
-    late = _Capture('ab', 2)
-    late.finish(False)
-    assert late.done.result() is False and late.add({'a': frame('a')})
 
 
 def test_folders_below_the_calibrations_are_counted(tmp_path):

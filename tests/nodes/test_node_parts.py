@@ -28,6 +28,7 @@ from fluoro_calib_ros.nodes import calibration_input, calibration_services
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
 from fluoro_calib_ros.nodes.calibration_services import OrientationService, SelfCalibration
 from fluoro_calib_ros.nodes.calibration_settings import CalibrationSettings, RigSetup
+from fluoro_calib_ros.nodes.exposure_input import PairWait
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     calibration_from_message,
     message_from_calibration,
@@ -302,6 +303,14 @@ def test_calibrations_wait_while_two_nodes_publish_them(calibration):
 # ---- orientation, and what requests may ask
 
 
+class Waits:
+    """Exposures that have .wait, the last wait for pairs of frames."""
+
+    def next_pairs(self, count):
+        self.wait = PairWait(count, False)
+        return self.wait
+
+
 def orientation_service(output):
     """Return the service orient of a rig of a and b, and a request to it."""
     node = SimpleNamespace(
@@ -319,7 +328,7 @@ def orientation_service(output):
         ),
     )
     parts = SimpleNamespace(
-        node=node, rig=rig, exposures=None, output=output, files=None, requests=Requests()
+        node=node, rig=rig, exposures=Waits(), output=output, files=None, requests=Requests()
     )
     return OrientationService(parts), SimpleNamespace(timeout_sec=1.0, frames=1)
 
@@ -343,7 +352,9 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
     monkeypatch.setattr(calibration_services, 'in_thread', lambda *_: (recalibrated(), None))
     capture = service._orient(request)
     capture.send(None)  # the capture waits for its frames
-    service.add({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
+    wait = service._exposures.wait
+    wait.pairs.append({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
+    wait.done.set_result(None)
     with pytest.raises(DataError, match='the calibrations have changed meanwhile'):
         capture.send(None)
 

@@ -11,12 +11,8 @@ from ..findings import Kind
 from ..options import declared
 from .arguments import (
     add_bag_options,
-    add_calibration,
-    add_covariance,
-    add_exit_zero,
     add_option,
-    add_out,
-    add_phantom,
+    add_shared,
     add_source,
     read_calibrated_exposures,
 )
@@ -42,12 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         'image size of a file that does not contain it [px] (default: that of the calibration)',
     )
-    add_phantom(source)
+    add_shared(source, 'phantom')
     add_bag_options(parser)
-    add_out(parser, 'result folder to write')
-    add_covariance(parser)
-    add_exit_zero(parser)
-    add_calibration(parser)
+    add_shared(parser, 'out', help='result folder to write')
+    add_shared(parser, 'covariance', 'exit_zero', 'calibration')
     add_option(parser, declared(CalibrationOptions)['loss'])
 
 

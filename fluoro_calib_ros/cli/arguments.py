@@ -83,6 +83,58 @@ def names(text: str) -> list[str]:
     return text.split(',')
 
 
+# Arguments that several commands have: keyword arguments of `add_argument`, by name.
+_SHARED: dict[str, dict[str, Any]] = {
+    'out': {'required': True, 'type': Path, 'metavar': 'DIR'},
+    'phantom': {
+        'required': True,
+        'type': Path,
+        'help': 'surveyed coordinates target_id,x,y,z,sd [mm], or another list of coordinates, an '
+        'XMALab frame specification, project or .xyz file',
+    },
+    'calibration': {
+        'required': True,
+        'type': Path,
+        'metavar': 'DIR',
+        'help': 'result folder of calibrate',
+    },
+    'orientation': {
+        'type': Path,
+        'metavar': 'FILE',
+        'help': 'orientation of the rig (default: rig_orientation.npz in the result folder)',
+    },
+    'image_size': {'type': image_size, 'metavar': 'WxH'},
+    'fluoroscopes': {
+        'type': names,
+        'metavar': 'A,B',
+        'help': 'names of the fluoroscopes to use (default: all)',
+    },
+    'principal_distance': {'type': number_in(1, 1e7), 'metavar': 'PX'},
+    'angle_deg': {'type': number_in(-720, 720), 'metavar': 'DEG'},  # see angle_of
+    'cluster': {'action': 'append', 'default': [], 'metavar': "'NAME: ID ID ...'"},
+    'covariance': {
+        'action': 'store_true',
+        'help': 'also write the covariance matrix of all unknowns (*.covariance.npz)',
+    },
+    'exit_zero': {
+        'action': 'store_true',
+        'help': 'exit with status 0 whatever the verdict; by default with 3 unless it is pass',
+    },
+    'workers': {
+        'type': number_in(1, 1024, int),
+        'default': 0,
+        'metavar': 'N',
+        'help': 'processes (default: as many as there are cores)',
+    },
+}
+
+
+def add_shared(parser: argparse._ActionsContainer, *shared: str, **changes: Any) -> None:
+    """Add arguments that several commands have; changes replace keyword arguments."""
+    for name in shared:
+        parser.add_argument('--' + name.replace('_', '-'), **{**_SHARED[name], **changes})
+
+
 def add_option(parser: Parser, option: Option, **changes: Any) -> None:
     """Add the argument of a declared option: --name with its choices, default and description.
 
@@ -134,22 +186,11 @@ def add_address(parser: argparse.ArgumentParser, server: str, port: int) -> None
     )
 
 
-def add_orientation(parser: Parser) -> None:
-    """Add --orientation, the file of the orientation of the rig."""
-    parser.add_argument(
-        '--orientation',
-        type=Path,
-        metavar='FILE',
-        help='orientation of the rig (default: rig_orientation.npz in the result folder)',
-    )
-
-
 def add_oriented_source(parser: argparse.ArgumentParser, options: type, **metavars: str) -> None:
     """Add the inputs of `read_oriented_source`, and options that include `RecordedPairing`."""
     add_source(parser, 'image size of a file [px] (default: that of the calibration)')
     add_bag_options(parser, pairing=False)
-    add_calibration(parser)
-    add_orientation(parser)
+    add_shared(parser, 'calibration', 'orientation')
     metavars = {'pair_tolerance': 'S', **metavars}
     add_options(parser, options, **{name: {'metavar': text} for name, text in metavars.items()})
 
@@ -223,47 +264,16 @@ def print_inputs(source: Path, survey: Survey | None, recording: Recording) -> N
     print_unpaired(source, recording.unpaired)
 
 
-def add_out(parser: Parser, text: str, metavar: str = 'DIR') -> None:
-    """Add --out, the output."""
-    parser.add_argument('--out', required=True, type=Path, metavar=metavar, help=text)
-
-
-def add_image_size(parser: Parser, text: str) -> None:
-    """Add --image-size."""
-    parser.add_argument('--image-size', type=image_size, metavar='WxH', help=text)
-
-
-def add_principal_distance(parser: Parser, text: str) -> None:
-    """Add --principal-distance."""
-    distance = number_in(1, 1e7)
-    parser.add_argument('--principal-distance', type=distance, metavar='PX', help=text)
-
-
-def add_clusters(parser: Parser, text: str) -> None:
-    """Add --cluster; `rigid_clusters` returns the bodies."""
-    metavar = "'NAME: ID ID ...'"
-    parser.add_argument('--cluster', action='append', default=[], metavar=metavar, help=text)
-
-
 def rigid_clusters(
     arguments: argparse.Namespace, error: Callable[[str], NoReturn]
 ) -> tuple[Body, ...]:
-    """Return the bodies of `add_clusters`; call error with a sentence for an invalid one."""
+    """Return the bodies given by --cluster; call error with a sentence for an invalid one."""
     from ..bodies.body import declared_bodies
 
     try:
         return declared_bodies(arguments.cluster)
     except ValueError as fault:
         error(f'--cluster: {fault}')
-
-
-def add_exit_zero(parser: Parser) -> None:
-    """Add --exit-zero, for commands that give a verdict."""
-    parser.add_argument(
-        '--exit-zero',
-        action='store_true',
-        help='exit with status 0 whatever the verdict; by default with 3 unless it is pass',
-    )
 
 
 def options_of(kind: type[T], arguments: argparse.Namespace, **values: Any) -> T:
@@ -308,8 +318,8 @@ def add_source(
         '2-D points or project, DeepLabCut, SLEAP, .pho (docs/formats.md)' + more,
     )
     group = parser.add_argument_group('input')
-    add_image_size(group, image_size_help)
-    add_fluoroscopes(group)
+    add_shared(group, 'image_size', help=image_size_help)
+    add_shared(group, 'fluoroscopes')
     group.add_argument(
         '--decisions',
         type=Path,
@@ -426,27 +436,6 @@ def file_settings(arguments: argparse.Namespace, **changes: Any) -> FileSettings
     return FileSettings(**settings)
 
 
-def add_fluoroscopes(parser: Parser, use: str = 'use') -> None:
-    """Add --fluoroscopes."""
-    parser.add_argument(
-        '--fluoroscopes',
-        type=names,
-        metavar='A,B',
-        help=f'names of the fluoroscopes to {use} (default: all)',
-    )
-
-
-def add_workers(parser: argparse._ActionsContainer) -> None:
-    """Add --workers, a number of processes."""
-    parser.add_argument(
-        '--workers',
-        type=number_in(1, 1024, int),
-        default=0,
-        metavar='N',
-        help='processes (default: as many as there are cores)',
-    )
-
-
 def add_scheduler(parser: argparse.ArgumentParser, task: str = 'extract the images') -> None:
     """Add --scheduler, the address of a Dask cluster for images."""
     group = parser.add_argument_group('images on a cluster')
@@ -482,54 +471,9 @@ def cluster_of(arguments: argparse.Namespace) -> Cluster | None:
     return Cluster(arguments.scheduler, *files, arguments.trusted_network)
 
 
-def add_phantom(parser: Parser, **changes: Any) -> None:
-    """Add --phantom; changes replace keyword arguments of `add_argument`."""
-    settings: dict[str, Any] = {
-        'required': True,
-        'type': Path,
-        'help': 'surveyed coordinates target_id,x,y,z,sd [mm], or another list of coordinates, an '
-        'XMALab frame specification, project or .xyz file',
-    }
-    settings.update(changes)
-    parser.add_argument('--phantom', **settings)
-
-
-def add_calibration(parser: Parser) -> None:
-    """Add --calibration."""
-    parser.add_argument(
-        '--calibration',
-        required=True,
-        type=Path,
-        metavar='DIR',
-        help='result folder of calibrate',
-    )
-
-
-def add_angle(
-    parser: Parser, use: str, default: str = 'unknown, the mean correction of its exposures'
-) -> None:
-    """Add --angle-deg; use: what the angle applies to, for the help."""
-    parser.add_argument(
-        '--angle-deg',
-        type=number_in(-720, 720),
-        metavar='DEG',
-        help=f'angle of the C-arm {use}, for a calibration that depends on it (default: '
-        f'{default})',
-    )
-
-
 def angle_of(arguments: argparse.Namespace) -> float | None:
     """Return the angle of the C-arm [rad] from --angle-deg, None without it."""
     return None if arguments.angle_deg is None else math.radians(arguments.angle_deg)
-
-
-def add_covariance(parser: Parser) -> None:
-    """Add --covariance."""
-    parser.add_argument(
-        '--covariance',
-        action='store_true',
-        help='also write the covariance matrix of all unknowns (*.covariance.npz)',
-    )
 
 
 def add_result_folder(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import printable
-from .arguments import add_options, add_out, names, options_of
+from .arguments import add_options, add_shared, names, options_of
 from .output import print_result
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         actions, 'recover', 'Write all intact messages of a damaged or cut-off bag to a new one.'
     )
     recover.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
-    add_out(recover, 'new bag, which must not exist', 'FOLDER')
+    add_shared(recover, 'out', help='new bag, which must not exist', metavar='FOLDER')
     info = _add_action(actions, 'info', 'Report the content and the faults of a bag.')
     info.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
 
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     record.add_argument(
         'topics', nargs='*', metavar='TOPIC', help='topics to record (default: all)'
     )
-    add_out(record, 'new bag, which must not exist', 'FOLDER')
+    add_shared(record, 'out', help='new bag, which must not exist', metavar='FOLDER')
     add_options(record, RecordingOptions)
     play = _add_action(
         actions, 'play', 'Publish the messages of a bag as they were recorded (needs ROS 2).'

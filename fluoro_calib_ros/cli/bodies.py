@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 from ..errors import DataError, ErrorsAt
 from ..findings import Severity
 from .arguments import (
-    add_exit_zero,
     add_oriented_source,
-    add_out,
+    add_shared,
     number_in,
     options_of,
     read_oriented_source,
@@ -67,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='another recording with all joints in neutral position, instead of the exposures '
         'that the joints file names',
     )
-    add_out(parser, 'folder to write')
+    add_shared(parser, 'out', help='folder to write')
     parser.add_argument(
         '--keep-shapes',
         action='store_true',
@@ -97,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='HZ',
         help='rate of the exposures, for files without times',
     )
-    add_exit_zero(parser)
+    add_shared(parser, 'exit_zero')
 
 
 def run(arguments: argparse.Namespace) -> bool:

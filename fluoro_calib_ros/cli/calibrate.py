@@ -15,13 +15,9 @@ from ..options import Option, declared
 from .arguments import (
     add_bag_options,
     add_collect,
-    add_covariance,
-    add_exit_zero,
     add_option,
-    add_out,
-    add_phantom,
-    add_principal_distance,
     add_scheduler,
+    add_shared,
     add_source,
     angle_options,
     cluster_of,
@@ -61,13 +57,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '; or radiographs: a folder with a folder of images for each fluoroscope, a bag with '
         'images',
     )
-    add_phantom(source)
+    add_shared(source, 'phantom')
     add_collect(source)
     add_scheduler(parser)
     add_bag_options(parser)
     _add_adjustment(parser)
     result = parser.add_argument_group('result')
-    add_out(result, 'result folder to write')
+    add_shared(result, 'out', help='result folder to write')
     result.add_argument(
         '--force',
         action='store_true',
@@ -83,8 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     result.add_argument(
         '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
     )
-    add_covariance(result)
-    add_exit_zero(result)
+    add_shared(result, 'covariance', 'exit_zero')
 
 
 def _add_adjustment(parser: argparse.ArgumentParser) -> None:
@@ -106,9 +101,10 @@ def _add_adjustment(parser: argparse.ArgumentParser) -> None:
     exclusive.add_argument(
         '--separate', action='store_true', help='one fluoroscope after the other (the default)'
     )
-    add_principal_distance(
+    add_shared(
         adjustment,
-        'start value, or with --interior fixed the value (default: from the observations)',
+        'principal_distance',
+        help='start value, or with --interior fixed the value (default: from the observations)',
     )
     adjustment.add_argument(
         '--known-orientation',

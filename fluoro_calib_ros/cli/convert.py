@@ -13,12 +13,9 @@ from typing import NoReturn
 from ..errors import DataError
 from .arguments import (
     UNITS,
-    add_angle,
     add_angle_options,
     add_file_options,
-    add_fluoroscopes,
-    add_image_size,
-    add_out,
+    add_shared,
     angle_of,
     angle_options,
     file_settings,
@@ -60,11 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='KIND',
         help=f'format to write: {"; ".join(map(_with_meaning, kinds_written()))}',
     )
-    add_out(
+    add_shared(
         parser,
-        'file to write; for mayacam2, opencv, camera_info, lut, deeplabcut and sleap a folder '
-        'with one file a fluoroscope, for bundle a folder',
-        'PATH',
+        'out',
+        help='file to write; for mayacam2, opencv, camera_info, lut, deeplabcut and sleap a '
+        'folder with one file a fluoroscope, for bundle a folder',
+        metavar='PATH',
     )
     parser.add_argument(
         '--from',
@@ -88,8 +86,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that select the content and the calibration."""
-    add_image_size(parser, 'where SOURCE does not contain it [px]')
-    add_fluoroscopes(parser, 'convert')
+    add_shared(parser, 'image_size', help='where SOURCE does not contain it [px]')
+    add_shared(parser, 'fluoroscopes', help='names of the fluoroscopes to convert (default: all)')
     parser.add_argument(
         '--exposure',
         type=number_in(0, 2**32 - 1, int),
@@ -108,8 +106,12 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='correct image points by the calibration before they are written',
     )
-    add_angle(
-        parser, 'of the corrections that are written, and of corrected points without angle_deg'
+    add_shared(
+        parser,
+        'angle_deg',
+        help='angle of the C-arm of the corrections that are written, and of corrected points '
+        'without angle_deg, for a calibration that depends on it (default: unknown, the mean '
+        'correction of its exposures)',
     )
     add_angle_options(parser)
 

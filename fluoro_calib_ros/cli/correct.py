@@ -12,12 +12,9 @@ from typing import TYPE_CHECKING
 from ..errors import DataError
 from ..findings import first_few
 from .arguments import (
-    add_angle,
-    add_calibration,
     add_file_options,
-    add_out,
     add_scheduler,
-    add_workers,
+    add_shared,
     angle_of,
     cluster_of,
     file_settings,
@@ -45,11 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '(png, tif, jpg, bmp, pgm), a folder of images, or a video (avi, mkv, mp4), or a '
         'recording (cine, dcm) such as trial.cine',
     )
-    add_calibration(parser)
-    add_out(
+    add_shared(parser, 'calibration')
+    add_shared(
         parser,
-        'file to write, whose suffix determines the format; a folder for a folder of images',
-        'OUT',
+        'out',
+        help='file to write, whose suffix determines the format; a folder for a folder of images',
+        metavar='OUT',
     )
     parser.add_argument(
         '--fluoroscopes',
@@ -65,7 +63,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='interpolation between the pixels of an image (default: linear)',
     )
     angle = parser.add_mutually_exclusive_group()
-    add_angle(angle, 'of images, and of points without angle_deg')
+    add_shared(
+        angle,
+        'angle_deg',
+        help='angle of the C-arm of images, and of points without angle_deg, for a calibration '
+        'that depends on it (default: unknown, the mean correction of its exposures)',
+    )
     angle.add_argument(
         '--angles',
         type=Path,
@@ -83,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='skip files that cannot be corrected, and list them; by default, one of them ends '
         'the command and nothing is written',
     )
-    add_workers(folders)
+    add_shared(folders, 'workers')
     add_scheduler(parser, 'correct the files; they see the folders under the same names')
     add_file_options(parser)
 

@@ -12,17 +12,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import ErrorsAt
 from .arguments import (
-    add_angle,
     add_angle_options,
-    add_clusters,
     add_file_options,
     add_options,
-    add_orientation,
-    add_out,
-    add_phantom,
-    add_principal_distance,
     add_scheduler,
-    add_workers,
+    add_shared,
     angle_of,
     angle_options,
     cluster_of,
@@ -56,8 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '(avi, mkv, mp4, cine), DICOM files, bags with images; an exposure has the number in the '
         'name of its file, else its position in the order',
     )
-    add_phantom(
+    add_shared(
         parser,
+        'phantom',
         required=False,
         help='surveyed coordinates target_id,x,y,z,sd[,diameter] [mm], or an XMALab frame '
         'specification, project or .xyz file',
@@ -72,9 +67,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='of the images; A,B or more for markers of calibrated fluoroscopes, with one SOURCE '
         'for each, or one that has a folder or a topic of each',
     )
-    add_out(parser, 'file of observations to write', 'CSV')
-    add_principal_distance(
-        parser, 'to some 10 %% (default: not known, about four times the width of the image)'
+    add_shared(parser, 'out', help='file of observations to write', metavar='CSV')
+    add_shared(
+        parser,
+        'principal_distance',
+        help='to some 10 %% (default: not known, about four times the width of the image)',
     )
     parser.add_argument(
         '--overlay',
@@ -82,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='DIR',
         help='folder for pictures of found, matched and rejected beads',
     )
-    add_workers(parser)
+    add_shared(parser, 'workers')
     add_scheduler(parser)
     parser.add_argument(
         '--regular-grid',
@@ -94,7 +91,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_markers(parser.add_argument_group('markers in motion'))
     angles = parser.add_argument_group('angle of a C-arm')
     add_angle_options(angles)
-    add_angle(angles, 'of all images, where no joint gives it', 'unknown')
+    add_shared(
+        angles,
+        'angle_deg',
+        help='angle of the C-arm of all images, where no joint gives it, for a calibration that '
+        'depends on it (default: unknown)',
+    )
     add_file_options(parser)
 
 
@@ -116,10 +118,11 @@ def _add_markers(group: argparse._ArgumentGroup) -> None:
         metavar='DIR',
         help='result folder of calibrate, for fluoroscopes that are followed together',
     )
-    add_orientation(group)
-    add_clusters(
+    add_shared(group, 'orientation')
+    add_shared(
         group,
-        "markers that are rigid together, such as 'tibia: 1001 1002 1003'; with two "
+        'cluster',
+        help="markers that are rigid together, such as 'tibia: 1001 1002 1003'; with two "
         'fluoroscopes or more, they predict and check each other; may be repeated',
     )
     group.add_argument(

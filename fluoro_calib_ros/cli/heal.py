@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arguments import (
-    add_exit_zero,
     add_oriented_source,
-    add_out,
+    add_shared,
     options_of,
     read_oriented_source,
 )
@@ -42,8 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'fluoro-calib bodies (default: those that were learned with the calibration, by '
         'fluoro-calib bodies --learn or by calibration_node)',
     )
-    add_out(parser, 'folder to write: calibrations and orientation as they are now, healing.json')
-    add_exit_zero(parser)
+    add_shared(
+        parser,
+        'out',
+        help='folder to write: calibrations and orientation as they are now, healing.json',
+    )
+    add_shared(parser, 'exit_zero')
 
 
 def run(arguments: argparse.Namespace) -> bool:

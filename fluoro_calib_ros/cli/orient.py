@@ -11,9 +11,7 @@ from ..errors import ErrorsAt
 from ..findings import Kind, sentences
 from .arguments import (
     add_bag_options,
-    add_calibration,
-    add_exit_zero,
-    add_phantom,
+    add_shared,
     add_source,
     read_calibrated_exposures,
 )
@@ -46,8 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     source = add_source(parser, 'image size of a file [px] (default: that of the calibration)')
     add_bag_options(parser)
-    add_calibration(parser)
-    add_phantom(source)
+    add_shared(parser, 'calibration')
+    add_shared(source, 'phantom')
     parser.add_argument(
         '--frame-id',
         default='rig',
@@ -60,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N,N-M',
         help='numbers of the frames in which the phantom stands in the rig frame (default: all)',
     )
-    add_exit_zero(parser)
+    add_shared(parser, 'exit_zero')
 
 
 def run(arguments: argparse.Namespace) -> bool:

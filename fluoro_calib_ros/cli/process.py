@@ -48,16 +48,15 @@ WRONG_DRIFT = ('warn', 'error')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from .arguments import add_exit_zero, number_in
+    from .arguments import add_shared
 
     parser.add_argument(
         'study', type=Path, metavar='STUDY', help=f'folder with a {STUDY}, or the file'
     )
-    parser.add_argument(
-        '--workers',
-        type=number_in(1, 256, int),
+    add_shared(
+        parser,
+        'workers',
         default=os.cpu_count() or 1,
-        metavar='N',
         help='trials that are processed at a time (default: as many as there are cores)',
     )
     parser.add_argument('--again', action='store_true', help='do all steps again')
@@ -66,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='print the commands of the study without running them',
     )
-    add_exit_zero(parser)
+    add_shared(parser, 'exit_zero')
 
 
 @dataclass(frozen=True)

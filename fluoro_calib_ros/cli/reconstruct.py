@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 from ..errors import ErrorsAt
 from .arguments import (
-    add_clusters,
     add_oriented_source,
-    add_out,
+    add_shared,
     options_of,
     read_oriented_source,
     rigid_clusters,
@@ -41,16 +40,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from ..jobs.reconstruction import ReconstructionOptions
 
     add_oriented_source(parser, ReconstructionOptions, reject='S')
-    add_out(parser, 'file to write', 'OUT.csv')
+    add_shared(parser, 'out', help='file to write', metavar='OUT.csv')
     parser.add_argument(
         '--figure',
         type=Path,
         metavar='FILE.png',
         help='draw the paths in space, when each target was found, and its sd',
     )
-    add_clusters(
+    add_shared(
         parser,
-        "rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
+        'cluster',
+        help="rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
         'drift watch also monitors; may be repeated',
     )
     parser.add_argument(

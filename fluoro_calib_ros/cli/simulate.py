@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from .arguments import add_options, add_out, options_of
+from .arguments import add_options, add_shared, options_of
 from .output import ProgressBar, print_result
 
 NAME = 'simulate'
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.simulation import SimulationOptions
 
-    add_out(parser, 'folder to write')
+    add_shared(parser, 'out', help='folder to write')
     add_options(parser, SimulationOptions, images={'nargs': '?', 'const': 'clean'})
 
 

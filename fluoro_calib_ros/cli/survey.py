@@ -13,9 +13,7 @@ from .arguments import (
     add_bag_options,
     add_collect,
     add_options,
-    add_out,
-    add_phantom,
-    add_principal_distance,
+    add_shared,
     add_source,
     file_settings,
     options_of,
@@ -55,8 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from ..estimation.options import CalibrationOptions
 
     source = add_source(parser, 'image size of a file that does not contain it [px]')
-    add_phantom(
+    add_shared(
         source,
+        'phantom',
         help='approximate coordinates, to a few centimetres for a phantom of a few decimetres; '
         'any phantom file, or one of the command phantom',
     )
@@ -73,7 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group = parser.add_argument_group('adjustment')
     add_options(group, CalibrationOptions, OPTIONS)
-    add_principal_distance(group, 'start value [px] (default: from the observations)')
+    add_shared(
+        group, 'principal_distance', help='start value [px] (default: from the observations)'
+    )
     parser.add_argument(
         '--keep-given',
         action='store_true',
@@ -83,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--force', action='store_true', help='write the coordinates even if the verdict is fail'
     )
-    add_out(parser, 'phantom file to write', 'OUT.csv')
+    add_shared(parser, 'out', help='phantom file to write', metavar='OUT.csv')
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -16,12 +16,9 @@ from ..exposures.frame import Frames
 from .arguments import (
     add_angle_options,
     add_collect,
-    add_exit_zero,
     add_file_options,
-    add_fluoroscopes,
-    add_image_size,
-    add_phantom,
     add_result_folder,
+    add_shared,
     angle_options,
     file_settings,
     result_folder,
@@ -46,16 +43,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='bag or file of image points from which the calibration was made (default: '
         'DIR/observations.csv)',
     )
-    add_phantom(parser, required=False, help='its surveyed coordinates (default: DIR/phantom.csv)')
-    add_image_size(
+    add_shared(
         parser,
-        'image size of a file given as --source [px] (default: that of the calibration)',
+        'phantom',
+        required=False,
+        help='its surveyed coordinates (default: DIR/phantom.csv)',
     )
-    add_fluoroscopes(parser, 'validate')
+    add_shared(
+        parser,
+        'image_size',
+        help='image size of a file given as --source [px] (default: that of the calibration)',
+    )
+    add_shared(parser, 'fluoroscopes', help='names of the fluoroscopes to validate (default: all)')
     add_angle_options(parser)
     add_collect(parser, 'a bag given as --source')
     add_file_options(parser)
-    add_exit_zero(parser)
+    add_shared(parser, 'exit_zero')
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:

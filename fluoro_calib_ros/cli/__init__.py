@@ -10,6 +10,7 @@ import contextlib
 import difflib
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -252,6 +253,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _run(words: list[str]) -> None:
     """Run the command given by words; exit with its status if that is not 0."""
     command = _command_of(words)
+    if isinstance(sys.stdout, TextIOWrapper):  # like standard error: any name can be printed
+        sys.stdout.reconfigure(errors='backslashreplace')
     try:
         options = parse_words(words)
         use_read_limits(options_of(ReadLimits, options))

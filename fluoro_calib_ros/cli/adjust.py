@@ -8,12 +8,12 @@ from __future__ import annotations
 import argparse
 
 from ..findings import Kind
-from ..options import declared
 from .arguments import (
     add_bag_options,
-    add_option,
+    add_options,
     add_shared,
     add_source,
+    input_paths,
     read_calibrated_exposures,
 )
 from .output import print_findings, print_result, styled_verdict
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bag_options(parser)
     add_shared(parser, 'out', help='result folder to write')
     add_shared(parser, 'covariance', 'exit_zero', 'calibration')
-    add_option(parser, declared(CalibrationOptions)['loss'])
+    add_options(parser, CalibrationOptions, ['loss'])
 
 
 def run(arguments: argparse.Namespace) -> bool:
@@ -56,8 +56,7 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..jobs.sources import select_calibrations
     from ..report.tables import summary_table
 
-    inputs = (arguments.source, arguments.phantom, arguments.calibration)
-    check_output_folder(arguments.out, RESULT_FOLDER, inputs)
+    check_output_folder(arguments.out, RESULT_FOLDER, input_paths(arguments))
     survey, recording, calibrations = read_calibrated_exposures(arguments)
     frames = recording.frames
     calibrations = select_calibrations(calibrations, frames, arguments.calibration)

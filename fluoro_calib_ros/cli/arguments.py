@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ..bodies.body import Body
     from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..exposures.angles import AngleOptions
-    from ..exposures.names import Names
     from ..io.access import PathLike
     from ..io.formats.content import FileSettings
     from ..jobs.scheduling import Cluster
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
 T = TypeVar('T')
 UNITS = ('mm', 'cm', 'm')
+_NO_INPUTS = ('out', 'figure', 'overlay', 'film')  # a film may contain the output
 READ_LIMITS = ('max_file_mb', 'max_image_megapixels', 'max_training_points')  # with options
 
 
@@ -151,10 +151,11 @@ def add_option(parser: Parser, option: Option, **changes: Any) -> None:
         settings['choices'] = option.choices
     elif option.length is not None:
         settings['type'] = numbers_of(option.length)
-    elif isinstance(option.default, float):
-        settings['type'] = _number(option, float)
-    elif isinstance(option.default, int) or option.default is None:
-        settings['type'] = _number(option, int)
+    elif option.default is None or isinstance(option.default, int | float):
+        low = -math.inf if option.minimum is None else option.minimum
+        high = math.inf if option.maximum is None else option.maximum
+        kind = float if isinstance(option.default, float) else int
+        settings['type'] = number_in(low, high, kind)
     settings.update(changes)
     parser.add_argument('--' + option.name.replace('_', '-'), **settings)
 
@@ -207,14 +208,10 @@ def read_oriented_source(
     from ..jobs.sources import read_calibrated_source
 
     recording, calibrations = read_calibrated_source(
-        arguments.source,
-        arguments.calibration,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
+        directory=arguments.calibration,
         # A frame without points, or with an invalid one, must not reject a recording.
         validate=False,
-        settings=file_settings(arguments),
-        selection=bag_selection(arguments, pairing=False),
+        **source_of(arguments, bag_selection(arguments, pairing=False)),
     )
     orientation = load_orientation(path)
     names = [name for name in orientation.fluoroscopes if name in recording.frames]
@@ -223,18 +220,17 @@ def read_oriented_source(
     return recording, calibrations, orientation
 
 
-def read_exposures(arguments: argparse.Namespace, names: Names) -> Recording:
-    """Read the source of a command with --collect; names: the known ones. Raises DataError."""
-    from ..jobs.sources import read_source
-
-    return read_source(
-        arguments.source,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        collect=arguments.collect,
-        settings=file_settings(arguments, names=names),
-        selection=bag_selection(arguments),
-    )
+def source_of(
+    arguments: argparse.Namespace, selection: BagSelection, **settings: Any
+) -> dict[str, Any]:
+    """Return the arguments of `read_source` by name; settings replace some of `file_settings`."""
+    return {
+        'path': arguments.source,
+        'image_size': arguments.image_size,
+        'fluoroscopes': arguments.fluoroscopes,
+        'settings': file_settings(arguments, **settings),
+        'selection': selection,
+    }
 
 
 def read_calibrated_exposures(
@@ -247,15 +243,22 @@ def read_calibrated_exposures(
     stored_names = read_names(arguments.calibration)
     survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
     recording, calibrations = read_calibrated_source(
-        arguments.source,
-        arguments.calibration,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        settings=file_settings(arguments, names=survey.names),
-        selection=bag_selection(arguments),
+        directory=arguments.calibration,
+        **source_of(arguments, bag_selection(arguments), names=survey.names),
     )
     print_inputs(arguments.source, survey, recording)
     return survey, recording, calibrations
+
+
+def input_paths(arguments: argparse.Namespace) -> list[Path]:
+    """Return the files and folders that the arguments name, without those to write."""
+    return [
+        path
+        for name, value in vars(arguments).items()
+        if name not in _NO_INPUTS
+        for path in (value if isinstance(value, list) else [value])
+        if isinstance(path, Path)
+    ]
 
 
 def print_inputs(source: Path, survey: Survey | None, recording: Recording) -> None:
@@ -290,12 +293,6 @@ def add_read_limits(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('limits of what is read')
     metavar = {'metavar': 'N'}
     add_options(group, ReadLimits, READ_LIMITS, **dict.fromkeys(READ_LIMITS, metavar))
-
-
-def _number(option: Option, kind: type) -> Callable[[str], Any]:
-    low = -math.inf if option.minimum is None else option.minimum
-    high = math.inf if option.maximum is None else option.maximum
-    return number_in(low, high, kind)
 
 
 def _text(default: Any) -> str:

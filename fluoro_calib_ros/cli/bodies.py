@@ -16,6 +16,7 @@ from ..findings import Severity
 from .arguments import (
     add_oriented_source,
     add_shared,
+    input_paths,
     number_in,
     options_of,
     read_oriented_source,
@@ -119,8 +120,7 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..jobs.learning import learn_shapes
 
     path = arguments.orientation or orientation_path(arguments.calibration)
-    inputs = [arguments.source, arguments.calibration, path, arguments.bodies]
-    check_output_folder(arguments.out, BODIES_FOLDER, [*inputs, arguments.joints or path])
+    check_output_folder(arguments.out, BODIES_FOLDER, input_paths(arguments))
     bodies = read_bodies(arguments.bodies)
     joints = read_joints(arguments.joints, bodies) if arguments.joints else ()
     recording, calibrations, orientation = read_oriented_source(arguments, path)

@@ -20,11 +20,13 @@ from .arguments import (
     add_shared,
     add_source,
     angle_options,
+    bag_selection,
     cluster_of,
     file_settings,
+    input_paths,
     options_of,
     print_inputs,
-    read_exposures,
+    source_of,
 )
 from .output import (
     ProgressBar,
@@ -182,9 +184,7 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..jobs.calibration import run_calibration
     from ..jobs.result_folder import RESULT_FOLDER, save_outcome, write_covariances
 
-    inputs = [arguments.source, arguments.phantom, *arguments.known_orientation]
-    inputs += [arguments.decisions] if arguments.decisions else []
-    check_output_folder(arguments.out, RESULT_FOLDER, inputs)
+    check_output_folder(arguments.out, RESULT_FOLDER, input_paths(arguments))
     request, radiographs = _request(arguments)
     outcome = run_calibration(
         request,
@@ -259,11 +259,13 @@ def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
     """Read or extract the observations. Raises DataError."""
     from ..exposures.names import Names
     from ..jobs.image_sources import contains_images
-    from ..jobs.sources import with_decisions
+    from ..jobs.sources import read_source, with_decisions
 
     if contains_images(arguments.source):
         return with_decisions(_extracted(arguments, survey), arguments.decisions)
-    return read_exposures(arguments, Names() if survey is None else survey.names)
+    names = Names() if survey is None else survey.names
+    source = source_of(arguments, bag_selection(arguments), names=names)
+    return read_source(collect=arguments.collect, **source)
 
 
 def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:

@@ -19,6 +19,7 @@ from .arguments import (
     angle_of,
     angle_options,
     file_settings,
+    input_paths,
     number_in,
 )
 from .output import print_notes, print_result
@@ -127,7 +128,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.folder import check_output_file
     from ..jobs.conversion import ConversionRequest, convert
 
-    inputs = [path for path in (arguments.source, arguments.calibration) if path is not None]
+    inputs = input_paths(arguments)
     if arguments.out.resolve() in [path.resolve() for path in inputs]:
         raise DataError(f'{arguments.out}: the input would be overwritten, choose another output')
     if not arguments.out.is_dir():  # bags and formats with several files create or fill a folder

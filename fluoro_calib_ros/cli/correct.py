@@ -18,6 +18,7 @@ from .arguments import (
     angle_of,
     cluster_of,
     file_settings,
+    input_paths,
 )
 from .output import ProgressBar, print_note, print_notes, print_result
 
@@ -99,7 +100,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.sources import read_calibrations
 
     if arguments.source.is_file() or not arguments.out.is_dir():  # images can fill a folder
-        check_output_file(arguments.out, (arguments.source, arguments.calibration))
+        check_output_file(arguments.out, input_paths(arguments))
     names = None if arguments.fluoroscope is None else [arguments.fluoroscope]
     calibrations = read_calibrations(arguments.calibration, names)
     print_notes(disagreements(arguments.calibration, calibrations))
@@ -119,6 +120,11 @@ def _correct_points(arguments: argparse.Namespace, calibrations: Calibrations) -
     from ..io.observations import correct_points, write_points
     from ..jobs.sources import calibrated_settings, read_point_table
 
+    if arguments.angles is not None:
+        raise DataError(
+            f'{arguments.source}: --angles is for images; image points have their angles in a '
+            'column angle_deg'
+        )
     names = () if arguments.fluoroscope is None else (arguments.fluoroscope,)
     settings = file_settings(arguments, fluoroscopes=names)
     settings = calibrated_settings(settings, arguments.calibration, calibrations)

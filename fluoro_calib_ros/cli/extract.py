@@ -21,6 +21,7 @@ from .arguments import (
     angle_options,
     cluster_of,
     file_settings,
+    input_paths,
     names,
     options_of,
     rigid_clusters,
@@ -193,7 +194,7 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
 
     fluoroscope = arguments.fluoroscope[0]
     check_safe_name(fluoroscope, '--fluoroscope')
-    check_output_file(arguments.out, (*arguments.sources, arguments.phantom))
+    check_output_file(arguments.out, input_paths(arguments))
     survey = read_survey(arguments.phantom, file_settings(arguments))
     print_notes(survey.notes)
     angles = ImageAngles(angle_options(arguments), angle_of(arguments))
@@ -265,13 +266,7 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 
     for name in arguments.fluoroscope:
         check_safe_name(name, '--fluoroscope')
-    optional_inputs = (
-        arguments.markers,
-        arguments.calibration,
-        arguments.cluster_shapes,
-        arguments.bodies,
-    )
-    inputs = [*arguments.sources, *(path for path in optional_inputs if path is not None)]
+    inputs = input_paths(arguments)
     doubtful_path = arguments.out.with_name(f'{arguments.out.stem}.{DOUBTFUL}')
     check_output_file(arguments.out, inputs)
     check_output_file(doubtful_path, inputs)

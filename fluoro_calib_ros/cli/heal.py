@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from .arguments import (
     add_oriented_source,
     add_shared,
+    input_paths,
     options_of,
     read_oriented_source,
 )
@@ -65,8 +66,7 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..jobs.learning import learned_for
 
     path = arguments.orientation or orientation_path(arguments.calibration)
-    inputs = [arguments.source, arguments.calibration, path, arguments.bodies or path]
-    check_output_folder(arguments.out, HEALING_FOLDER, inputs)
+    check_output_folder(arguments.out, HEALING_FOLDER, input_paths(arguments))
     bodies = read_bodies(arguments.bodies) if arguments.bodies else ()
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     learned = None if bodies else learned_for(arguments.calibration, orientation)

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import DataError, shortened
 from ..io.rig_file import STUDY
+from .arguments import add_shared, input_paths
 from .output import NOT_PASSED, print_result, print_status
 
 if TYPE_CHECKING:
@@ -48,8 +49,6 @@ WRONG_DRIFT = ('warn', 'error')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from .arguments import add_shared
-
     parser.add_argument(
         'study', type=Path, metavar='STUDY', help=f'folder with a {STUDY}, or the file'
     )
@@ -251,16 +250,9 @@ class _StepMaker:
                 error(f'the key {key} is set by the study')
             if name != SOURCE:
                 all_words += _option_words(key, value, error)
-        values = vars(self._parse(all_words, error))
-        rig_file = values.get('rig_file')
-        paths = [
-            path
-            for key, value in values.items()
-            if key != 'out'
-            for path in (value if isinstance(value, list) else [value])
-            if isinstance(path, Path)
-        ]
-        paths += [rig_file.path] if rig_file is not None else []
+        arguments = self._parse(all_words, error)
+        paths = input_paths(arguments)
+        paths += [arguments.rig_file.path] if arguments.rig_file is not None else []
         return Step(trial, tuple(all_words), tuple(paths), out)
 
 

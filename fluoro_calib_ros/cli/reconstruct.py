@@ -14,6 +14,7 @@ from ..errors import ErrorsAt
 from .arguments import (
     add_oriented_source,
     add_shared,
+    input_paths,
     options_of,
     read_oriented_source,
     rigid_clusters,
@@ -84,8 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.reconstruction import ReconstructionOptions, reconstruct
 
     path = arguments.orientation or orientation_path(arguments.calibration)
-    inputs = [arguments.source, arguments.calibration, path]
-    inputs += filter(None, [arguments.decisions])
+    inputs = input_paths(arguments)
     check_output_file(arguments.out, inputs)
     if arguments.figure is not None:
         check_output_file(arguments.figure, [*inputs, arguments.out])

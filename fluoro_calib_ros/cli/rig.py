@@ -43,7 +43,7 @@ def find_rig(words: Sequence[str], command: str) -> RigFile | None:
     """
     if command not in USED:
         return None
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser = argparse.ArgumentParser(add_help=False, exit_on_error=False)
     parser.add_argument('--rig', type=Path)
     try:
         path = parser.parse_known_args(list(words))[0].rig

@@ -15,10 +15,12 @@ from .arguments import (
     add_options,
     add_shared,
     add_source,
+    bag_selection,
     file_settings,
+    input_paths,
     options_of,
     print_inputs,
-    read_exposures,
+    source_of,
 )
 from .output import print_findings, print_result, print_round
 
@@ -92,13 +94,13 @@ def run(arguments: argparse.Namespace) -> None:
     from ..estimation.options import CalibrationOptions
     from ..io.folder import check_output_file
     from ..io.phantom import write_phantom
-    from ..jobs.sources import read_survey
+    from ..jobs.sources import read_source, read_survey
     from ..jobs.survey import SurveyRequest, survey
 
-    inputs = [arguments.source, arguments.phantom]
-    check_output_file(arguments.out, [*inputs, *filter(None, [arguments.decisions])])
+    check_output_file(arguments.out, input_paths(arguments))
     initial = read_survey(arguments.phantom, file_settings(arguments))
-    recording = read_exposures(arguments, initial.names)
+    source = source_of(arguments, bag_selection(arguments), names=initial.names)
+    recording = read_source(collect=arguments.collect, **source)
     print_inputs(arguments.source, initial, recording)
     request = SurveyRequest(
         recording.frames,

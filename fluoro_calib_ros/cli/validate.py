@@ -22,6 +22,7 @@ from .arguments import (
     angle_options,
     file_settings,
     result_folder,
+    source_of,
 )
 from .output import print_notes, print_result, print_step, print_unpaired
 
@@ -124,14 +125,8 @@ def _request(
     phantom = None
     settings = calibrated_settings(file_settings(arguments), arguments.directory, rig)
     if arguments.source is not None:
-        recording = read_source(
-            arguments.source,
-            image_size=arguments.image_size,
-            fluoroscopes=arguments.fluoroscopes,
-            collect=arguments.collect,
-            settings=settings,
-            selection=BagSelection(angles=angle_options(arguments)),
-        )
+        source = source_of(arguments, BagSelection(angles=angle_options(arguments)))
+        recording = read_source(collect=arguments.collect, **{**source, 'settings': settings})
         print_notes(recording.notes)
         print_unpaired(arguments.source, recording.unpaired)
         frames = recording.frames

@@ -169,20 +169,34 @@ def make_folder(path: PathLike) -> None:
 # Atomic writing: afterwards either the complete new file or the old one exists.
 
 
+def start_of_hidden(target: str) -> str:
+    """Return the start of the names of hidden files and folders that are written for a path."""
+    name = os.path.basename(target).encode(errors='surrogateescape')
+    return f'.{name[:100].decode(errors="ignore")}.'  # file systems limit names to 255 bytes
+
+
+def hidden_path(target: str, mark: str, suffix: str) -> str:
+    """Return the path of a hidden file or folder next to a path; mark: letters and digits."""
+    return os.path.join(os.path.dirname(target), f'{start_of_hidden(target)}{mark}.{suffix}')
+
+
 @contextmanager
 def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
     """Open a temporary file for writing; rename it to path when the block ends without an error.
 
-    mode is 'wb', or 'w' for UTF-8 text without conversion of line ends. Raises DataError if the
-    file cannot be written. After any exception an earlier file is unchanged.
+    mode is 'wb', or 'w' for UTF-8 text without conversion of line ends, in which bytes of a file
+    name that are not UTF-8 are escaped, as JSON does. Raises DataError if the file cannot be
+    written. After any exception an earlier file is unchanged.
     """
     target = os.path.realpath(path)  # write through a symbolic link, do not replace it
-    folder, name = os.path.split(target)
+    folder = os.path.dirname(target)
     if os.path.lexists(target) and not os.path.isfile(target):
         kind = 'a directory' if os.path.isdir(target) else 'a device or pipe'
         raise DataError(f'{path}: cannot be written (this is {kind}, not a file)')
-    temporary = os.path.join(folder, f'.{name[:100]}.{secrets.token_hex(8)}.tmp')
-    text_options: dict[str, Any] = {} if 'b' in mode else {'encoding': 'utf-8', 'newline': ''}
+    temporary = hidden_path(target, secrets.token_hex(8), 'tmp')
+    text_options: dict[str, Any] = {}
+    if 'b' not in mode:
+        text_options = {'encoding': 'utf-8', 'errors': 'backslashreplace', 'newline': ''}
     try:
         with open(temporary, mode.replace('w', 'x'), **text_options) as file:
             yield file
@@ -191,13 +205,12 @@ def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
         os.replace(temporary, target)
         sync_folder(folder)
     except OSError as error:
-        _remove(temporary)
         if isinstance(error, FileNotFoundError) and not os.path.isdir(folder):
             raise DataError(f'{path}: cannot be written, there is no folder {folder}') from None
         raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
-    except BaseException:
-        _remove(temporary)
-        raise
+    finally:
+        with suppress(OSError):  # it has been renamed unless there was an error
+            os.unlink(temporary)
 
 
 def delete_file(path: Path) -> None:
@@ -214,7 +227,8 @@ def write_bytes(path: PathLike, content: bytes) -> None:
 
 def write_text(path: PathLike, text: str) -> None:
     """Write a UTF-8 text file atomically. Raises DataError if it cannot be written."""
-    write_bytes(path, text.encode())
+    with atomic_file(path, 'w') as file:
+        file.write(text)
 
 
 def sync_folder(folder: PathLike) -> None:
@@ -225,8 +239,3 @@ def sync_folder(folder: PathLike) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
-
-
-def _remove(path: PathLike) -> None:
-    with suppress(OSError):
-        os.unlink(path)

@@ -25,7 +25,14 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from ..errors import DataError
-from .access import PathLike, make_folder, os_error_reason, os_errors, sync_folder
+from .access import (
+    PathLike,
+    hidden_path,
+    make_folder,
+    os_errors,
+    start_of_hidden,
+    sync_folder,
+)
 
 try:
     import fcntl
@@ -130,8 +137,7 @@ def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
         os.path.join(target, os.path.basename(target)) if in_place else target, 'tmp'
     )
     try:
-        lock = _make_locked(staging)
-        try:
+        with os_errors(path, 'cannot be written'), _locked_folder(staging):
             if not in_place and os.path.isdir(target):
                 shutil.copymode(target, staging)
                 _carry_over(target, staging, kind)
@@ -140,18 +146,9 @@ def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
             if in_place:
                 _move_entries(staging, target, kind)
             else:
-                _put_in_place(staging, target)
-        finally:
-            os.close(lock)
-    except OSError as error:
-        _delete(staging)
-        raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
+                put_in_place(staging, target)
     except DataError as error:
-        _delete(staging)
         raise DataError(str(error).replace(staging, str(path))) from None
-    except BaseException:
-        _delete(staging)
-        raise
 
 
 @contextmanager
@@ -161,20 +158,14 @@ def temporary_folder(path: PathLike) -> Iterator[Path]:
     Folders left behind by killed runs are deleted, too. Raises DataError that names the path if
     the folder cannot be created, and for an OSError in the block.
     """
-    parent, name = os.path.split(os.path.abspath(path))
-    folder = _hidden(os.path.join(parent, name), 'tmp')
-    try:
-        with os_errors(path, 'cannot be written'):
-            for leftover in _leftovers(parent, name):
-                if leftover.endswith('.tmp') and not _is_locked(leftover):
-                    shutil.rmtree(leftover)
-            lock = _make_locked(folder)
-            try:
-                yield Path(folder)
-            finally:
-                os.close(lock)
-    finally:
-        _delete(folder)
+    target = os.path.abspath(path)
+    folder = _hidden(target, 'tmp')
+    with os_errors(path, 'cannot be written'):
+        for leftover in _leftovers(os.path.dirname(target), target):
+            if leftover.endswith('.tmp') and not _is_locked(leftover):
+                shutil.rmtree(leftover)
+        with _locked_folder(folder):
+            yield Path(folder)
 
 
 def clean_up(path: PathLike) -> None:
@@ -186,7 +177,7 @@ def clean_up(path: PathLike) -> None:
     parent = os.path.dirname(target)
     with os_errors(path, 'files left by an earlier run cannot be removed'):
         for folder in (parent, target):
-            for leftover in _leftovers(folder, os.path.basename(target)):
+            for leftover in _leftovers(folder, target):
                 if not _is_locked(leftover):
                     _settle(leftover, target)
 
@@ -205,10 +196,13 @@ def _settle(leftover: str, target: str) -> None:
         shutil.rmtree(leftover)
 
 
-def _put_in_place(staging: str, target: str) -> None:
-    """Rename a complete folder to the target; keep the old one as the previous."""
-    parent, name = os.path.split(target)
-    complete = os.path.join(parent, f'.{name[:100]}.{os.stat(staging).st_ino}.swap')
+def put_in_place(staging: str, target: str) -> None:
+    """Rename a complete folder to the target; keep the old one as the previous.
+
+    Raises OSError; the old one is then unchanged.
+    """
+    parent = os.path.dirname(target)
+    complete = hidden_path(target, str(os.stat(staging).st_ino), 'swap')
     os.rename(staging, complete)
     try:
         if not os.path.lexists(target):
@@ -288,6 +282,19 @@ def _carry_over(old: str, new: str, kind: FolderKind) -> None:
             link(source, os.path.join(new, name))
 
 
+@contextmanager
+def _locked_folder(path: str) -> Iterator[None]:
+    """Create a folder that is locked until the block ends; then delete it unless it was moved."""
+    try:
+        lock = _make_locked(path)
+        try:
+            yield
+        finally:
+            os.close(lock)
+    finally:
+        _delete(path)
+
+
 def _make_locked(path: str) -> int:
     """Create a folder that is locked as long as this process lives; return its lock."""
     while True:
@@ -321,11 +328,11 @@ def _lock(folder: int) -> None:
         fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def _leftovers(folder: str, name: str) -> list[str]:
-    """Return the paths of hidden folders that were created to replace the folder `name`."""
+def _leftovers(folder: str, target: str) -> list[str]:
+    """Return the paths of hidden folders in a folder that were created to replace the target."""
     if not os.path.isdir(folder):
         return []
-    start = f'.{name[:100]}.'
+    start = start_of_hidden(target)
     leftovers = []
     for entry in sorted(os.listdir(folder)):
         mark, _, suffix = entry.removeprefix(start).partition('.')
@@ -337,8 +344,7 @@ def _leftovers(folder: str, name: str) -> list[str]:
 
 
 def _hidden(target: str, suffix: str) -> str:
-    parent, name = os.path.split(target)
-    return os.path.join(parent, f'.{name[:100]}.{secrets.token_hex(8)}.{suffix}')
+    return hidden_path(target, secrets.token_hex(8), suffix)
 
 
 def _is_fixed(target: str, kind: FolderKind) -> bool:

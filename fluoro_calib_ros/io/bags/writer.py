@@ -21,8 +21,8 @@ from mcap.writer import CompressionType, Writer
 
 from ...errors import DataError
 from ...exposures.frame import Frame
-from ..access import PathLike, os_errors, sync_folder, write_text
-from ..folder import PREVIOUS, keep_as_previous
+from ..access import PathLike, hidden_path, os_errors, sync_folder, write_text
+from ..folder import PREVIOUS, put_in_place
 from .metadata import (
     NO_MESSAGE_NS,
     PROFILES,
@@ -74,10 +74,8 @@ class BagWriter:
         self.name = os.path.basename(self.path)
         self._overwrite = overwrite
         self._live = live
-        self._folder = self.path
-        if not live:
-            hidden = f'.{self.name}.{secrets.token_hex(8)}.tmp'
-            self._folder = os.path.join(os.path.dirname(self.path), hidden)
+        hidden = hidden_path(self.path, secrets.token_hex(8), 'tmp')
+        self._folder = self.path if live else hidden
         self._topics: dict[str, BagTopic] = {}
         self._files: list[FileSpan] = []
         self._total = FileSpan()
@@ -108,8 +106,13 @@ class BagWriter:
                 document = bag_metadata(self._topics.values(), self._files, self._total)
                 text = to_yaml({'rosbag2_bagfile_information': document}) + '\n'
                 write_text(os.path.join(self._folder, 'metadata.yaml'), text)
-                if not self._live:
-                    _put_in_place(self._folder, self.path, self._overwrite)
+                if self._overwrite:
+                    sync_folder(self._folder)
+                    put_in_place(self._folder, self.path)
+                elif not self._live:
+                    sync_folder(self._folder)
+                    os.rename(self._folder, self.path)
+                    sync_folder(os.path.dirname(self.path))
         except BaseException:
             self._abandon()
             raise
@@ -301,21 +304,3 @@ def check_replaceable(path: str, overwrite: bool) -> None:
                 f'{path}: the folder holds {name}, which does not belong to a bag; '
                 f'it is not overwritten'
             )
-
-
-def _put_in_place(folder: str, path: str, overwrite: bool) -> None:
-    """Rename a finished folder; with overwrite, keep the replaced bag as NAME.previous."""
-    sync_folder(folder)
-    backup = f'{folder}.old'
-    replaced = overwrite and os.path.isdir(path)
-    if replaced:
-        os.rename(path, backup)
-    try:
-        os.rename(folder, path)
-    except OSError:
-        if replaced:
-            os.rename(backup, path)
-        raise
-    if replaced:
-        keep_as_previous(backup, path)
-    sync_folder(os.path.dirname(path))

@@ -56,7 +56,8 @@ def print_result(
     if arguments.json:
         from ..io.documents import json_text
 
-        print(json_text(document).rstrip('\n'))
+        is_utf_8 = (sys.stdout.encoding or '').lower().startswith('utf')
+        print(json_text(document, ensure_ascii=not is_utf_8).rstrip('\n'))
         return
     print(text.rstrip('\n'))
     if next_step:

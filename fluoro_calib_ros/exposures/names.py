@@ -18,6 +18,7 @@ from ..errors import DataError
 
 MAX_ID = 2**32 - 1  # ids are uint32 in the messages
 _NUMBERED = re.compile(r'(?P<before>.*?)(?P<number>\d+)(?P<after>\D*)')
+_IS_ID = re.compile('0|[1-9][0-9]{0,9}')
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]')
 _MAX_NAME = 100  # maximum length of a fluoroscope id, in characters
 
@@ -72,15 +73,22 @@ def number_names(names: Iterable[str], known: Mapping[str, int] | None = None) -
 
     A known name keeps its id. If all others contain a number and differ in nothing else, such as
     bead01, bead02 or 3.tif, 7.tif, the number becomes the id, so that independent files agree.
-    Otherwise they are counted in their order, from the first free number.
+    Otherwise those that are free ids keep them, so that a file with ids agrees, and the others are
+    counted in their order, from the first free number. Raises DataError if there is none.
     """
     known = known or {}
     new_names = [name for name in dict.fromkeys(names) if name not in known]
     used_numbers = set(known.values())
     ids = _common_numbers(new_names)
     if ids is None or used_numbers & set(ids):
-        first_number = max(used_numbers, default=0) + 1
+        kept = [name for name in new_names if _IS_ID.fullmatch(name) and int(name) <= MAX_ID]
+        kept = [name for name in kept if int(name) not in used_numbers]
+        known = {**known, **{name: int(name) for name in kept}}
+        new_names = [name for name in new_names if name not in known]
+        first_number = max(known.values(), default=0) + 1
         ids = list(range(first_number, first_number + len(new_names)))
+        if ids and ids[-1] > MAX_ID:
+            raise DataError(f'there is no id up to {MAX_ID} for the name {new_names[-1]!r}')
     return {**known, **dict(zip(new_names, ids))}
 
 

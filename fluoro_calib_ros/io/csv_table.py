@@ -63,9 +63,11 @@ class Block:
         return values
 
     def floats_or_nan(self, name: str) -> NDArray[np.float64]:
-        """Return a column (n,) of numbers, NaN for an empty cell. Raises DataError."""
+        """Return a column (n,) of finite numbers, NaN for an empty cell. Raises DataError."""
         cells = [cell or 'nan' for cell in self.strings(name)]
-        return np.array(self._convert(name, cells, float, 'a number'))
+        values = np.array(self._convert(name, cells, float, 'a number'))
+        self.require(name, ~np.isinf(values), 'not a finite number')
+        return values
 
     def ids(self, name: str) -> NDArray[np.int64]:
         """Return a column (n,) of whole numbers from 0 to MAX_ID. Raises DataError.
@@ -214,22 +216,23 @@ def write_table(path: PathLike, header: Iterable[str], rows: Iterable[Iterable[A
     Table(tuple(header), rows).write(path)
 
 
-# A spreadsheet evaluates a cell that begins with one of these characters as a formula. A leading
-# apostrophe marks such a name as text; it is added on writing and removed on reading.
+# A spreadsheet evaluates a cell that begins with one of these characters as a formula, and a row
+# that begins with # is a comment. A leading apostrophe marks such a name as text; it is added on
+# writing and removed on reading.
 _FORMULA = frozenset('=+-@')
-_SUSPICIOUS = _FORMULA | {"'"}
+_MARKED = _FORMULA | {'#'}
 
 
-def as_text(cell: str) -> str:
-    """Return a cell, with a leading apostrophe if a spreadsheet would evaluate it as a formula."""
+def as_text(cell: str, marks: frozenset[str] = _FORMULA) -> str:
+    """Return a cell, with a leading apostrophe if it begins with a mark and is no number."""
     unquoted = cell.lstrip("'")
-    return f"'{cell}" if unquoted[:1] in _FORMULA and not is_number(unquoted) else cell
+    return f"'{cell}" if unquoted[:1] in marks and not is_number(unquoted) else cell
 
 
 def _as_texts(row: Iterable[Any]) -> list[Any]:
     return [
-        (as_text(c) if c[:1] in _SUSPICIOUS else c)
-        if type(c) is str
+        as_text(c, _MARKED)
+        if isinstance(c, str)
         else format_float(c)
         if isinstance(c, float)
         else c
@@ -238,8 +241,8 @@ def _as_texts(row: Iterable[Any]) -> list[Any]:
 
 
 def from_text(cell: str) -> str:
-    """Return a cell without the apostrophe that `as_text` adds."""
-    return cell[1:] if cell[:1] == "'" and as_text(cell[1:]) == cell else cell
+    """Return a cell without the apostrophe of a name that begins with a mark."""
+    return cell[1:] if cell[:1] == "'" and as_text(cell[1:], _MARKED) == cell else cell
 
 
 def format_float(value: float) -> str:
@@ -280,6 +283,15 @@ def _separator(text: str) -> str:
     lines = (match[0].strip() for match in re.finditer(r'[^\r\n]+', text))
     header = next((line for line in lines if line and not line.startswith('#')), '')
     return ';' if ';' in header and ',' not in header else ','
+
+
+def has_columns(lines: Iterable[str], required: Iterable[str]) -> bool:
+    """Return whether the first lines of a file are those of a table with these columns."""
+    text = '\n'.join(lines)
+    with suppress(DataError):
+        _, header = next(_numbered_rows('', text), (0, []))
+        return set(required) <= {name.strip() for name in header}
+    return False
 
 
 def _check_header(where: str, header: Sequence[str], required: Sequence[str]) -> None:
@@ -405,13 +417,13 @@ def read_names(directory: PathLike) -> Names:
     path = Path(directory) / NAMES_FILE
     if not path.exists():
         return Names()
-    tables: dict[str, dict[str, Any]] = {attribute: {} for attribute in _KINDS.values()}
+    tables: dict[str, dict[str, Any]] = {kind: {} for kind in _KINDS}
+    ids: dict[str, set[Any]] = {kind: set() for kind in _KINDS}
     for block in read_blocks(path, COLUMNS):
         columns = zip(*(block.strings(name) for name in COLUMNS))
         for index, (kind, identity, name) in enumerate(columns):
             if kind not in _KINDS:
                 block.fail(index, f'kind is {kind!r}, not {", ".join(_KINDS)}')
-            table = tables[_KINDS[kind]]
             value: Any = identity
             if kind == 'fluoroscope':
                 check_safe_name(identity, f'{path}, row {block.lines[index]}')
@@ -421,7 +433,8 @@ def read_names(directory: PathLike) -> Names:
                     value = int(without_zeros(identity))
                 if not 0 <= value <= MAX_ID:
                     block.fail(index, f'id is {identity!r}, not an integer')
-            if name in table or value in table.values():
+            if name in tables[kind] or value in ids[kind]:
                 block.fail(index, f'the {kind} {name!r}, id {identity}, is given twice')
-            table[name] = value
-    return Names(**tables)
+            tables[kind][name] = value
+            ids[kind].add(value)
+    return Names(**{_KINDS[kind]: table for kind, table in tables.items()})

@@ -206,11 +206,10 @@ def write_json(path: PathLike, document: Mapping[str, Any]) -> None:
     write_text(path, json_text(document))
 
 
-def json_text(document: Mapping[str, Any]) -> str:
+def json_text(document: Mapping[str, Any], ensure_ascii: bool = False) -> str:
     """Return a document as JSON text, indented by two spaces, keys in their given order."""
-    return (
-        json.dumps(to_json_values(document), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
-    )
+    values = to_json_values(document)
+    return json.dumps(values, indent=2, allow_nan=False, ensure_ascii=ensure_ascii) + '\n'
 
 
 def to_json_values(value: Any) -> Any:

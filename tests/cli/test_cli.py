@@ -748,3 +748,25 @@ def test_the_arguments_of_the_process_are_those_of_the_command(monkeypatch, caps
 def test_version(capsys):
     assert run('--version') == 0
     assert re.match(r'fluoro_calib_ros \S.* \(Python 3\.\d+\.\d+', capsys.readouterr().out)
+
+
+def test_output_of_any_name_is_told_on_any_terminal(rig, result, tmp_path):
+    """The result is written; a terminal that cannot show its name gets it escaped."""
+    environment = {**os.environ, 'PYTHONIOENCODING': 'ascii'}
+    points = tmp_path / 'points.csv'
+    points.write_text('fluoroscope,u,v\na,500,500\n')
+    words = ('correct', points, '--calibration', result, '--out', tmp_path / 'Größe.csv')
+    done = command(*words, env=environment)
+    assert done.returncode == 0 and done.stderr == ''
+    assert 'Gr\\xf6\\xdfe.csv' in done.stdout
+    told = json.loads(command(*words, '--json', env=environment).stdout)
+    assert told['out'] == str(tmp_path / 'Größe.csv')
+
+
+def test_angles_of_images_are_not_ignored_for_image_points(result, tmp_path, capsys):
+    points = tmp_path / 'points.csv'
+    points.write_text('fluoroscope,u,v\na,500,500\n')
+    words = ('correct', points, '--calibration', result, '--out', tmp_path / 'corrected.csv')
+    assert run(*words, '--angles', tmp_path / 'angles.csv') == 1
+    assert 'a column angle_deg' in capsys.readouterr().err
+    assert not (tmp_path / 'corrected.csv').exists()

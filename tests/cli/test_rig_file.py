@@ -220,3 +220,9 @@ def test_completion_script_is_valid_bash(capsys):
     assert ended.value.code == 0 and 'mayacam2' in script
     checked = subprocess.run(['bash', '-n'], input=script, text=True, capture_output=True)
     assert checked.returncode == 0, checked.stderr
+
+
+def test_shortened_option_names_the_rig_file_too(rig):
+    """An abbreviation that argparse accepts must not be ignored."""
+    path = rig(WHOLE, 'other.toml')
+    assert find_rig(['calibrate', 'points.csv', '--ri', str(path)], 'calibrate').path == path

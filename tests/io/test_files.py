@@ -25,6 +25,7 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.io.access import atomic_file, write_bytes, write_text
+from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.calibration import (
     load_calibration,
     load_calibrations,
@@ -33,6 +34,7 @@ from fluoro_calib_ros.io.calibration import (
     save_orientation,
 )
 from fluoro_calib_ros.io.documents import read_json, write_json
+from fluoro_calib_ros.io.folder import FolderKind, replaced_folder
 from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.io.observations import (
@@ -817,3 +819,24 @@ def test_damaged_json_is_reported_with_its_row(tmp_path):
     )
     assert 'no object' in message_of(read_json, text_file(tmp_path, 'r.json', '[1]'))
     assert 'nested' in message_of(read_json, text_file(tmp_path, 'r.json', '[' * 100_000))
+
+
+def test_names_as_long_as_a_file_system_allows_are_written(tmp_path):
+    """Hidden names on the way there are longer by their marks, and limited in bytes."""
+    name = '日' * 80  # 240 bytes
+    write_text(tmp_path / f'{name}.csv', 'text')
+    assert (tmp_path / f'{name}.csv').read_text() == 'text'
+    with replaced_folder(tmp_path / name, FolderKind('a folder', ('*',), ('*',))) as folder:
+        (folder / 'part').write_text('part')
+    assert (tmp_path / name / 'part').exists()
+    bag = tmp_path / ('n' * 240)
+    with BagWriter(bag) as writer:
+        writer.write_frame(Frame('a', 1, np.array([1]), np.array([[1.0, 2.0]]), SIZE))
+    assert sorted(os.listdir(tmp_path)) == sorted([f'{name}.csv', name, bag.name])
+
+
+def test_file_names_that_are_not_utf_8_are_escaped_in_texts(tmp_path):
+    write_json(tmp_path / 'about.json', {'source': 'caf\udce9.csv'})
+    assert read_json(tmp_path / 'about.json') == {'source': 'caf\udce9.csv'}
+    write_text(tmp_path / 'report.html', 'caf\udce9.csv')
+    assert (tmp_path / 'report.html').read_bytes() == b'caf\\udce9.csv'

@@ -6,7 +6,8 @@
 import pytest
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.exposures.names import Names
+from fluoro_calib_ros.exposures.names import MAX_ID, Names, number_names
+from fluoro_calib_ros.io import csv_table
 from fluoro_calib_ros.io.csv_table import NAMES_FILE, read_names, write_names, write_table
 
 NAMES = Names({'tib, lat': 4, 'fem "a"': 2}, {'trial 3.tif': 3}, {'Röntgen 1': 'R_ntgen_1'})
@@ -59,3 +60,43 @@ def test_numbers_are_written_as_they_are(tmp_path):
     path = tmp_path / 'numbers.csv'
     write_table(path, ['-1.5', 'name'], [[-1.5, '-1.5', '+2', '-inf', '-1e-05', 'nan', 'name', 3]])
     assert path.read_text() == '-1.5,name\n-1.5,-1.5,+2,-inf,-1e-05,nan,name,3\n'
+
+
+def test_many_names_are_looked_up_not_searched(tmp_path):
+    """Each id is compared once with those before it, whatever their number."""
+    names = Names({f'bead {number}': number for number in range(20_000)})
+    write_names(tmp_path, names)
+    comparisons = 0
+
+    class Counted(int):
+        def __eq__(self, other):
+            nonlocal comparisons
+            comparisons += 1
+            return int(self) == other
+
+        __hash__ = int.__hash__
+
+    before = csv_table.int if hasattr(csv_table, 'int') else int
+    csv_table.int = Counted
+    try:
+        assert read_names(tmp_path).targets == names.targets
+    finally:
+        csv_table.int = before
+    assert comparisons < 100_000
+
+
+@pytest.mark.parametrize(
+    ('given', 'known', 'ids'),
+    [
+        (['top', '1', '2'], {}, {'top': 3, '1': 1, '2': 2}),  # 1 and 2 are ids in other files
+        (['top', '1'], {'old': 1}, {'old': 1, 'top': 2, '1': 3}),
+        (['top', '007'], {}, {'top': 1, '007': 2}),
+    ],
+)
+def test_names_that_are_ids_keep_them_next_to_other_names(given, known, ids):
+    assert number_names(given, known) == ids
+
+
+def test_names_get_no_id_that_messages_cannot_hold():
+    with pytest.raises(DataError, match='no id up to'):
+        number_names(['top'], {'last': MAX_ID})

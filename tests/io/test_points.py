@@ -1247,3 +1247,78 @@ def _damaged(whole, rng):
     lines = whole.split(b'\n')
     lines[rng.integers(len(lines))] = lines[rng.integers(len(lines))]
     yield b'\n'.join(lines)
+
+
+MARKED = {'#1': 1, '-a': 2, '=b': 3, "'c": 4, 'd': 5}  # a comment, formulas, an apostrophe
+
+
+@pytest.mark.parametrize('kind', ['phantom', 'points', 'observations', 'xmalab2d', 'xmalab3d'])
+def test_names_that_begin_with_a_mark_return(tmp_path, kind):
+    """A row that begins with # is a comment, a cell with = a formula; a name may begin so."""
+    ids = np.array(list(MARKED.values()))
+    xyz = np.random.default_rng(1).uniform(-50, 50, (2, 5, 3))
+    content = Content(
+        observations={'cam1': [Frame('cam1', 1, ids, 500 + xyz[0, :, :2], SIZE)]},
+        survey=Phantom(ids, xyz[0], np.full(5, 0.1)),
+        points=points_without_precision(np.array([1, 2]), ids, xyz, 10.0),
+        names=Names(MARKED),
+    )
+    registry.write(tmp_path / 'out.csv', kind, content, SETTINGS)
+    found = registry.read(tmp_path / 'out.csv', SETTINGS)
+    assert found.names.targets == MARKED
+    if kind == 'phantom':
+        assert np.array_equal(found.survey.xyz_mm, xyz[0])
+
+
+@pytest.mark.parametrize(
+    ('kind', 'name', 'cause'),
+    [
+        ('xmalab2d', 'a,b', 'a comma'),
+        ('xmalab3d', 'a,b', 'a comma'),
+        ('xmalab3d', 'a\nb', 'a line end'),
+        ('trc', 'a\tb', 'a tabulator'),
+    ],
+)
+def test_names_that_would_be_two_cells_are_not_written(tmp_path, kind, name, cause):
+    ids = np.array([1, 2, 3, 4])
+    xyz = np.random.default_rng(1).uniform(0, 50, (1, 4, 3))
+    content = Content(
+        observations={'cam1': [Frame('cam1', 1, ids, xyz[0, :, :2], SIZE)]},
+        points=points_without_precision(np.array([1]), ids, xyz, 10.0),
+        names=Names({name: 1}),
+    )
+    with pytest.raises(DataError, match=cause):
+        registry.write(tmp_path / 'out', kind, content, SETTINGS)
+    assert not (tmp_path / 'out').exists()
+
+
+POSE_ROWS = (
+    'body,exposure,time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw',
+    'tibia,1,0.0,1.5,2.5,3.5,0.0,0.0,0.0,1.0',
+    'tibia,2,0.1,1.5,2.5,4.5,0.0,0.0,0.0,1.0',
+)
+
+
+@pytest.mark.parametrize(
+    'rewritten',
+    [
+        lambda text: text.replace(',', ';').replace('.', ','),  # as spreadsheets save it
+        lambda text: text.replace('body', '"body"').replace('time_s', '"time_s"'),
+        lambda text: '# walking\n' + text,
+        lambda text: text.replace(',', ', '),
+    ],
+)
+def test_poses_are_recognised_however_they_were_saved(tmp_path, rewritten):
+    path = tmp_path / 'poses.csv'
+    path.write_text(rewritten('\n'.join(POSE_ROWS) + '\n'))
+    bodies = registry.read(path, SETTINGS).bodies
+    assert bodies.names == ('tibia',) and bodies.rate_hz == 10
+    assert bodies.translation_mm[:, 0].tolist() == [[1.5, 2.5, 3.5], [1.5, 2.5, 4.5]]
+
+
+def test_coordinates_that_are_not_finite_are_refused(tmp_path):
+    """Other programs, and this one, do not read a file with them."""
+    path = tmp_path / 'points.csv'
+    path.write_text('frame,target_id,x,y,z\n1,1,1,2,3\n2,1,inf,2,3\n')
+    with pytest.raises(DataError, match="row 3: x is 'inf', not a finite number"):
+        registry.read(path, SETTINGS)

@@ -36,7 +36,7 @@ from ...photogrammetry.rotations import (
 )
 from ..access import PathLike, atomic_file
 from ..bodies import COLUMNS as POSE_COLUMNS
-from ..csv_table import as_text, read_all
+from ..csv_table import as_text, has_columns, read_all
 from .content import (
     UNITS_MM,
     Bodies,
@@ -53,6 +53,7 @@ from .tables import (
     Row,
     ascending_frames,
     bodies_of,
+    check_labels,
     frames_of,
     joined,
     rate_of,
@@ -171,8 +172,6 @@ def _read_poses(path: Path, settings: FileSettings) -> Content:
     frame = rows.ids('exposure')
     seconds, *columns = (rows.floats_or_nan(name) for name in _POSES[2:])
     values = np.column_stack(columns)
-    for name, column in zip(_POSES[3:], columns):
-        rows.require(name, ~np.isinf(column), 'not a finite number')
     names = list(dict.fromkeys(body.tolist()))
     frames, row = np.unique(frame, return_inverse=True)
     body_index = np.array([names.index(name) for name in body.tolist()])
@@ -202,7 +201,7 @@ POSES = Format(
     'poses',
     'poses of bodies, poses.csv of the command bodies',
     parts=('bodies',),
-    recognise=lambda sample: sample.first.startswith(','.join(_POSES)),
+    recognise=lambda sample: has_columns(sample.lines, _POSES),
     read=_read_poses,
     write=None,
 )
@@ -275,9 +274,7 @@ def _write(
     cells: Iterable[Sequence[str]],
 ) -> None:
     """Write a table. Raises DataError for a label that contains a tabulator or a line end."""
-    for label in labels:
-        if any(mark in label for mark in '\t\r\n'):
-            raise DataError(f'{path}: the name {label!r} contains a tabulator or a line end')
+    check_labels(path, labels, '\t')
     with atomic_file(path, 'w') as file:
         for line in (*header, END, '\t'.join(('time', *labels))):
             file.write(line + '\n')

@@ -25,7 +25,7 @@ from ...photogrammetry.rig_orientation import KnownOrientation
 from ..access import PathLike, read_text, write_text
 from ..bodies import NAME_COLUMN
 from ..bodies import POINT_COLUMNS as POINTS
-from ..csv_table import read_all, write_table
+from ..csv_table import has_columns, read_all, write_table
 from ..documents import read_yaml
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
@@ -47,14 +47,6 @@ from .tables import rate_of
 
 POINTS_NEEDED = ('frame', 'target_id', 'x', 'y', 'z')
 GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
-
-
-def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
-    lines = [line for line in sample.lines if not line.startswith('#')]
-    if not lines:
-        return False
-    separator = ';' if ';' in lines[0] else ','
-    return set(columns) <= {cell.strip().strip('"') for cell in lines[0].split(separator)}
 
 
 def _read_observations(path: Path, settings: FileSettings) -> Content:
@@ -179,7 +171,7 @@ FORMATS = (
         'observations',
         f'image points, {_OWN}',
         parts=('observations',),
-        recognise=lambda sample: _has_columns(sample, OBSERVATIONS),
+        recognise=lambda sample: has_columns(sample.lines, OBSERVATIONS),
         read=_read_observations,
         write=_write_observations,
     ),
@@ -187,7 +179,7 @@ FORMATS = (
         'phantom',
         f'phantom, {_OWN}',
         parts=('survey',),
-        recognise=lambda sample: _has_columns(sample, PHANTOM),
+        recognise=lambda sample: has_columns(sample.lines, PHANTOM),
         read=_read_phantom,
         write=_write_phantom,
     ),
@@ -195,7 +187,7 @@ FORMATS = (
         'points',
         f'reconstructed points, {_OWN}',
         parts=('points',),
-        recognise=lambda sample: _has_columns(sample, POINTS_NEEDED),
+        recognise=lambda sample: has_columns(sample.lines, POINTS_NEEDED),
         read=_read_points,
         write=_write_points,
     ),
@@ -203,7 +195,7 @@ FORMATS = (
         'grid',
         f'points of a distortion grid, {_OWN}',
         parts=('grids',),
-        recognise=lambda sample: _has_columns(sample, GRID),
+        recognise=lambda sample: has_columns(sample.lines, GRID),
         read=_read_grid,
         write=_write_grid,
     ),

@@ -27,7 +27,7 @@ from ...limits import read_limits
 from ..access import read_text, write_text
 from ..csv_table import decimal_comma_advice, decimal_point, is_number, without_zeros
 from .content import UNITS_MM, Content, FileSettings, Format, Sample, Written, from_units, in_units
-from .tables import Row, joined, separator_of, table_of
+from .tables import Row, check_labels, joined, separator_of, table_of
 
 _COLUMN = re.compile(r'"?([a-z]+)(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?"?')
 # Synonyms of column names.
@@ -295,8 +295,7 @@ def _write_framespec(path: Path, content: Content, settings: FileSettings) -> Wr
     lines = ['x y z']
     for target, xyz in zip(survey.target_id.tolist(), in_units(survey.xyz_mm, mm)):
         name = target_names.get(target, str(target))
-        if set(name) & set(',;\n'):
-            raise DataError(f'{path}: a bead cannot be called {name!r} in this format')
+        check_labels(path, [name], ',;')
         lines.append(f'{joined(xyz)},{name}')
     write_text(path, '\n'.join(lines) + '\n')
     loss_note = f'{path}: the format has no standard deviation, those of the survey are lost'

@@ -54,6 +54,7 @@ from .tables import (
     Row,
     ascending_frames,
     bodies_of,
+    check_labels,
     frames_of,
     joined,
     labels,
@@ -384,6 +385,7 @@ def _write_trc(path: Path, content: Content, settings: FileSettings) -> Written:
     points = points_of(content.points, frames_of(path, [content.points], settings))
     unit = settings.units or 'mm'
     names = labels(content)
+    check_labels(path, names, '\t')
     rate = number_text(points.rate_hz or math.nan)
     frames = str(len(points.frame))
     first_frame = int(points.frame[0])

@@ -21,7 +21,7 @@ from ...exposures.names import Names, number_names, without_trivial
 from ...findings import sentence_of
 from ...limits import MAX_ROWS
 from ..access import PathLike, atomic_file, check_rows, read_text
-from ..csv_table import decimal_comma_advice, split_rows, without_zeros
+from ..csv_table import decimal_comma_advice, from_text, split_rows, without_zeros
 from .content import Bodies, Content, FileSettings, Points
 
 MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
@@ -134,7 +134,7 @@ def table_of(path: PathLike, text: str, separator: str | None = None) -> list[Ro
     else:
         lines = io.StringIO(text, newline='')
         split = split_rows(path, lines, separator or separator_of(text), 'a table')
-        rows = [Row(path, n, list(map(str.strip, cells))) for n, cells in split]
+        rows = [Row(path, n, [from_text(cell.strip()) for cell in cells]) for n, cells in split]
     rows = [row for row in rows if any(row.cells)]
     if not rows:
         raise DataError(f'{path}: the file has no rows')
@@ -195,10 +195,30 @@ def joined(values: Sequence[float] | np.ndarray, separator: str = ',') -> str:
     return separator.join(number_text(value) for value in np.asarray(values, dtype=float).tolist())
 
 
+# Characters that names in a table cannot contain, as named in messages.
+_MARKS = {
+    ',': 'a comma',
+    ';': 'a semicolon',
+    '\t': 'a tabulator',
+    '\r': 'a line end',
+    '\n': 'a line end',
+}
+
+
+def check_labels(path: PathLike, labels: Iterable[str], marks: str) -> None:
+    """Raise DataError for a name with a line end, or with a mark that separates cells."""
+    for label in labels:
+        for mark in (*marks, '\r', '\n'):
+            if mark in label:
+                raise DataError(f'{path}: the name {label!r} contains {_MARKS[mark]}')
+
+
 def write_frames(
     path: PathLike, columns: Iterable[str], frame: NDArray[np.int64], values: NDArray[np.float64]
 ) -> None:
     """Write a table with the column Frame and the numbers (m, ...) of each frame (m,)."""
+    columns = list(columns)
+    check_labels(path, columns, ',;\t')
     with atomic_file(path, 'w') as file:
         file.write(','.join(['Frame', *columns]) + '\n')
         for number, numbers in zip(frame.tolist(), values):

@@ -27,6 +27,7 @@ from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Written
 from .tables import (
     Row,
+    check_labels,
     check_row_count,
     default_name,
     frame_numbers,
@@ -176,6 +177,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     labels = [target_names.get(i, default_name(i)) for i in ids]
     shift = int(numbers[0] == 0)
     check_row_count(path, numbers[-1], shift)
+    check_labels(path, labels, ',;\t')
     with atomic_file(path, 'w') as file:
         file.write(
             ','.join(

@@ -465,9 +465,9 @@ def _doubts(row: Mapping[str, Any], findings: Iterable[Mapping[str, Any]]) -> di
 
 def _write_table(out: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Write the table of all trials; return its path. Raises DataError."""
-    from ..io.csv_table import write_table
+    from ..io.csv_table import Table
 
-    columns = list(dict.fromkeys(key for row in rows for key in row))
+    columns = tuple(dict.fromkeys(key for row in rows for key in row))
     path = out / TABLE
-    write_table(path, columns, ([row.get(column, '') for column in columns] for row in rows))
+    Table(columns, ([row.get(column, '') for column in columns] for row in rows)).write(path)
     return path

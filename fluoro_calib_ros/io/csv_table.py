@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, quoted
+from ..exposures.frame import MAX_ANGLE
 from ..exposures.names import MAX_ID, Names, number_names
 from ..findings import sentence_of
 from ..limits import MAX_ROWS_CSV
@@ -68,6 +69,12 @@ class Block:
         values = np.array(self._convert(name, cells, float, 'a number'))
         self.require(name, ~np.isinf(values), 'not a finite number')
         return values
+
+    def angles_deg(self, name: str) -> NDArray[np.float64]:
+        """Return a column (n,) of angles [degrees], NaN for an empty cell. Raises DataError."""
+        angles = self.floats_or_nan(name)
+        self.require(name, ~(np.abs(angles) > np.degrees(MAX_ANGLE)), 'not an angle')
+        return angles
 
     def ids(self, name: str) -> NDArray[np.int64]:
         """Return a column (n,) of whole numbers from 0 to MAX_ID. Raises DataError.
@@ -209,11 +216,6 @@ def dataframe_of(tables: Mapping[str, Table], name: str) -> pandas.DataFrame:
         names = ', '.join(file.removesuffix('.csv') for file in tables)
         raise DataError(f'no table is named {name!r}, but {names}')
     return tables[f'{name}.csv'].to_dataframe()
-
-
-def write_table(path: PathLike, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file from a header and rows of cells. Raises DataError."""
-    Table(tuple(header), rows).write(path)
 
 
 # A spreadsheet evaluates a cell that begins with one of these characters as a formula, and a row
@@ -409,7 +411,7 @@ def write_names(directory: PathLike, names: Names) -> None:
         for kind, attribute in _KINDS.items()
         for name, identity in getattr(names, attribute).items()
     )
-    write_table(path, COLUMNS, rows)
+    Table(COLUMNS, rows).write(path)
 
 
 def read_names(directory: PathLike) -> Names:

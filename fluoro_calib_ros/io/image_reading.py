@@ -18,7 +18,6 @@ import numpy as np
 from tifffile import TiffFile, TiffFileError
 
 from ..errors import DataError, ErrorsAt
-from ..exposures.frame import MAX_ANGLE
 from ..images.codec import as_grey, check_size, decode
 from .access import PathLike, check_regular_file, os_error_reason, read_bytes
 from .csv_table import read_blocks
@@ -43,10 +42,8 @@ def read_image_angles(path: PathLike) -> dict[int, float]:
     for block in read_blocks(path, COLUMNS):
         numbers = block.ids('image')
         block.require('image', numbers > 0, 'the first image is 1')
-        degrees = block.floats_or_nan('angle_deg')
-        valid = np.isnan(degrees) | (np.abs(degrees) <= np.degrees(MAX_ANGLE))
-        block.require('angle_deg', valid, 'not an angle')
-        for index, (number, angle) in enumerate(zip(numbers.tolist(), np.radians(degrees))):
+        angles_rad = np.radians(block.angles_deg('angle_deg'))
+        for index, (number, angle) in enumerate(zip(numbers.tolist(), angles_rad)):
             if number in rows:
                 block.fail(index, f'image {number} is already in row {rows[number]}')
             rows[number] = int(block.lines[index])

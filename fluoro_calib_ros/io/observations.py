@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from ..correction.fluoroscope_calibration import (
 from ..errors import DataError
 from ..exposures.frame import (
     DECIMALS,
-    MAX_ANGLE,
     Frame,
     Frames,
     angle_in_degrees,
@@ -46,7 +46,6 @@ from .csv_table import (
     from_text,
     read_all,
     read_blocks,
-    write_table,
 )
 
 ANGLE = 'angle_deg'
@@ -205,16 +204,44 @@ def observation_table(
     corrected_by: Mapping[str, str] | None = None,
 ) -> Table:
     """Return frames as a table; see write_observations_csv."""
+    names = names or Names()
+    fluoroscopes = names.fluoroscope_names()
+    exposures = names.exposure_names()
+    targets = names.target_names()
+    if not all(frame.number in exposures for frame in frames):
+        exposures = {}
+    if not all(int(i) in targets for frame in frames for i in frame.target_id):
+        targets = {}
     with_sigma = any(frame.sigma is not None for frame in frames)
     with_angle = any(frame.angle is not None for frame in frames)
-    labels = _labels(frames, names or Names())
+
+    def rows() -> Iterator[list[Any]]:
+        for frame in frames:
+            unknown = np.full(len(frame.target_id), np.nan)
+            sigma = unknown if frame.sigma is None else frame.sigma
+            more: list[Iterable[Any]] = [sigma.tolist()] * with_sigma
+            more += [repeat(_angle_cell(frame))] * with_angle
+            if corrected_by:
+                more.append(repeat(corrected_by.get(frame.fluoroscope, '')))
+            name = fluoroscopes.get(frame.fluoroscope, frame.fluoroscope)
+            yield from _rows_of(frame, name, exposures, targets, more)
+
     header = COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle
-    rows = (
-        [*row, *([corrected_by.get(frame.fluoroscope, '')] if corrected_by else [])]
-        for frame in frames
-        for row in _csv_rows(frame, with_sigma, with_angle, labels)
-    )
-    return Table(header + (CORRECTED_BY,) * bool(corrected_by), rows)
+    return Table(header + (CORRECTED_BY,) * bool(corrected_by), rows())
+
+
+def _rows_of(
+    frame: Frame,
+    name: str,
+    exposures: Mapping[int, str],
+    targets: Mapping[int, str],
+    more: Iterable[Iterable[Any]] = (),
+) -> Iterator[list[Any]]:
+    """Yield COLUMNS and more columns of each image point, with the names of ids that have one."""
+    number = int(frame.number)
+    ids = [targets.get(i, i) for i in np.asarray(frame.target_id).tolist()]
+    for cells in zip(ids, *np.asarray(frame.uv, float).T.tolist(), *more):
+        yield [name, exposures.get(number, number), *cells]
 
 
 def corrections_of(path: PathLike) -> dict[str, str]:
@@ -230,26 +257,6 @@ def corrections_of(path: PathLike) -> dict[str, str]:
     return {name: identity for name, identity in corrections.items() if identity}
 
 
-@dataclass(frozen=True)
-class _Labels:
-    """Names to write instead of ids; a mapping is empty if its column contains ids."""
-
-    fluoroscopes: Mapping[str, str]
-    exposures: Mapping[int, str]
-    targets: Mapping[int, str]
-
-
-def _labels(frames: Sequence[Frame], names: Names) -> _Labels:
-    """Return the names to write; exposures and targets need a name for each of their ids."""
-    exposures = names.exposure_names()
-    targets = names.target_names()
-    if not all(frame.number in exposures for frame in frames):
-        exposures = {}
-    if not all(int(i) in targets for frame in frames for i in frame.target_id):
-        targets = {}
-    return _Labels(names.fluoroscope_names(), exposures, targets)
-
-
 def _parse(block: Block, columns: _Columns) -> _Rows:
     """Return a block of the file as arrays; add new names to columns."""
     names = block.strings('fluoroscope')
@@ -260,26 +267,14 @@ def _parse(block: Block, columns: _Columns) -> _Rows:
                 check_safe_name(name, f'{block.path}, row {block.lines[names.index(name)]}')
             codes[name] = len(codes)
     uv = np.column_stack([block.floats(name, NOT_SEEN) for name in 'uv'])
-    sigma = np.full(len(uv), np.nan)
-    if 'sigma' in block:
-        sigma = block.floats_or_nan('sigma')
-        is_empty = np.array([cell == '' for cell in block.strings('sigma')])
-        block.require('sigma', is_empty | is_positive(sigma), 'not a finite number above 0')
-    angle = np.full(len(uv), np.nan)
-    if ANGLE in block:
-        angle = block.floats_or_nan(ANGLE)
-        block.require(
-            ANGLE, np.isnan(angle) | (np.abs(angle) <= np.degrees(MAX_ANGLE)), 'not an angle'
-        )
-    code = np.array([codes[name] for name in names])
-    exposure = columns.exposure.read(block)
+    unknown = np.full(len(uv), np.nan)
     return _Rows(
-        code,
-        exposure,
+        np.array([codes[name] for name in names]),
+        columns.exposure.read(block),
         target_id=columns.target.read(block),
         uv=uv,
-        sigma=sigma,
-        angle=angle,
+        sigma=_sigma(block, ('',)) if 'sigma' in block else unknown,
+        angle=block.angles_deg(ANGLE) if ANGLE in block else unknown,
         line=block.lines,
     )
 
@@ -341,23 +336,6 @@ def _angle(path: PathLike, where: str, rows: _Rows) -> float | None:
     return None if np.isnan(rows.angle[0]) else float(np.radians(rows.angle[0]))
 
 
-def _csv_rows(
-    frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
-) -> Iterator[list[Any]]:
-    fluoroscope = labels.fluoroscopes.get(frame.fluoroscope, frame.fluoroscope)
-    exposure = labels.exposures.get(int(frame.number), int(frame.number))
-    columns: list[Iterable[Any]] = [
-        [labels.targets.get(i, i) for i in np.asarray(frame.target_id).tolist()],
-        *np.asarray(frame.uv, float).T.tolist(),
-    ]
-    if with_sigma:
-        sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
-        columns.append(sigma.tolist())
-    if with_angle:
-        columns.append([_angle_cell(frame)] * len(frame.target_id))
-    return ([fluoroscope, exposure, *cells] for cells in zip(*columns))
-
-
 # Observations extracted from images: `fluoroscope,exposure,target_id,u,v,sigma,overlapped`.
 #
 # The columns after sigma are flags: files of tracked markers also have `doubtful`. If images have
@@ -379,31 +357,22 @@ def write_extracted(
     one. Raises DataError if the file cannot be written.
     """
     with_angle = any(frame.angle is not None for frame, _ in frames)
-    rows = (
-        [*row, _angle_cell(frame)] if with_angle else row
-        for frame, values in frames
-        for row in _rows(path, frame, values, target_names)
-    )
-    write_table(path, (*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle), rows)
+
+    def rows() -> Iterator[list[Any]]:
+        for frame, values in frames:
+            check_safe_name(frame.fluoroscope, path)
+            assert frame.sigma is not None
+            rounded = replace(frame, uv=np.round(frame.uv, DECIMALS))
+            more: list[Iterable[Any]] = [np.round(frame.sigma, DECIMALS).tolist()]
+            more += [flag.astype(int).tolist() for flag in values]
+            more += [repeat(_angle_cell(frame))] * with_angle
+            yield from _rows_of(rounded, frame.fluoroscope, {}, target_names, more)
+
+    Table((*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle), rows()).write(path)
 
 
 def _angle_cell(frame: Frame) -> float:
     return np.nan if frame.angle is None else float(angle_in_degrees(frame.angle))
-
-
-def _rows(
-    path: PathLike,
-    frame: Frame,
-    flags: Sequence[NDArray[np.bool_]],
-    target_names: Mapping[int, str],
-) -> Iterator[list[object]]:
-    """Yield the rows of a frame, with flags (n,) as the last columns."""
-    check_safe_name(frame.fluoroscope, path)
-    assert frame.sigma is not None
-    numbers = np.round(np.column_stack([frame.uv, frame.sigma]), DECIMALS).tolist()
-    flagged = np.column_stack(flags).astype(int).tolist()
-    for target, row, flag in zip(frame.target_id.tolist(), numbers, flagged):
-        yield [frame.fluoroscope, frame.number, target_names.get(target, target), *row, *flag]
 
 
 # Image points of a CSV file, to be corrected and written with all other columns unchanged.
@@ -447,18 +416,13 @@ def points_of_frames(path: PathLike, frames: Frames, names: Names) -> PointsFile
     if not all_frames:
         raise DataError(f'{path}: the file has no image points')
     rows = [
-        [
-            f.fluoroscope,
-            str(exposures.get(f.number, f.number)),
-            str(targets.get(i, i)),
-            *map(repr, uv),
-        ]
+        list(map(str, row))
         for f in all_frames
-        for i, uv in zip(f.target_id.tolist(), f.uv.tolist())
+        for row in _rows_of(f, f.fluoroscope, exposures, targets)
     ]
     return PointsFile(
         path=path,
-        header=['fluoroscope', 'exposure', 'target_id', 'u', 'v'],
+        header=list(COLUMNS),
         rows=rows,
         lines=np.arange(2, len(rows) + 2),
         uv=np.concatenate([f.uv for f in all_frames]),
@@ -479,6 +443,8 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     """
     table = read_all(path, ('u', 'v'))
     header = table.header
+    names = table.strings('fluoroscope') if 'fluoroscope' in header else []
+    names = [(known or {}).get(name, name) for name in names]
     points = PointsFile(
         path=path,
         header=header,
@@ -486,8 +452,8 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
         lines=table.lines,
         uv=np.column_stack([table.floats_or_nan('u'), table.floats_or_nan('v')]),
         sigma=_sigma(table) if 'sigma' in header else None,
-        fluoroscope=_fluoroscopes(table, known or {}) if 'fluoroscope' in header else None,
-        angle=_image_angle(table) if ANGLE in header else None,
+        fluoroscope=np.array(names) if 'fluoroscope' in header else None,
+        angle=np.radians(table.angles_deg(ANGLE)) if ANGLE in header else None,
     )
     if CORRECTED_BY in header:
         raise DataError(
@@ -502,20 +468,12 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     return points
 
 
-def _fluoroscopes(block: Block, known: Mapping[str, str]) -> NDArray[np.str_]:
-    return np.array([known.get(name, name) for name in block.strings('fluoroscope')])
-
-
-def _sigma(block: Block) -> NDArray[np.float64]:
+def _sigma(block: Block, unknown: tuple[str, ...] = ('', 'nan')) -> NDArray[np.float64]:
+    """Return the column sigma [px], NaN for cells that say that it is unknown."""
     sigma = block.floats_or_nan('sigma')
-    block.require('sigma', np.isnan(sigma) | is_positive(sigma), 'not a finite number above 0')
+    is_unknown = np.array([cell.lower() in unknown for cell in block.strings('sigma')])
+    block.require('sigma', is_unknown | is_positive(sigma), 'not a finite number above 0')
     return sigma
-
-
-def _image_angle(block: Block) -> NDArray[np.float64]:
-    angle = np.radians(block.floats_or_nan(ANGLE))
-    block.require(ANGLE, np.isnan(angle) | (np.abs(angle) <= MAX_ANGLE), 'not an angle')
-    return angle
 
 
 def correct_points(
@@ -577,4 +535,4 @@ def write_points(path: PathLike, points: PointsFile, corrected: CorrectedPoints)
         [*row, *values, STATUS[status]]
         for row, values, status in zip(points.rows, numbers, corrected.status.tolist())
     )
-    write_table(path, points.header + points.added_columns, rows)
+    Table((*points.header, *points.added_columns), rows).write(path)

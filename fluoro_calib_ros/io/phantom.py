@@ -16,7 +16,7 @@ from ..exposures.names import Names, without_trivial
 from ..exposures.phantom import Phantom, first_repeated
 from ..limits import read_limits
 from .access import PathLike
-from .csv_table import Block, NamedColumn, read_all, read_blocks, write_table
+from .csv_table import Block, NamedColumn, Table, read_all, read_blocks
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
 DIAMETER = 'diameter'  # diameter of the beads, optional
@@ -108,7 +108,7 @@ def write_phantom(path: PathLike, phantom: Phantom, names: Names | None = None) 
         header = (*COLUMNS, DIAMETER)
         columns.append(phantom.diameter_mm)
     rows = (
-        [labels.get(target, target), *map(repr, row)]
+        [labels.get(target, target), *row]
         for target, row in zip(phantom.target_id.tolist(), np.column_stack(columns).tolist())
     )
-    write_table(path, header, rows)
+    Table(header, rows).write(path)

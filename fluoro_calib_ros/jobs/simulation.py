@@ -23,7 +23,7 @@ from ..io.bags.writer import BagWriter
 from ..io.bodies import COLUMNS as POSE_COLUMNS
 from ..io.bodies import JOINT_COLUMNS as JOINT_COLUMNS
 from ..io.bodies import joint_definition, write_bodies
-from ..io.csv_table import write_table
+from ..io.csv_table import Table
 from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
 from ..io.observations import COLUMNS as OBSERVATION_COLUMNS
@@ -123,7 +123,7 @@ def write_exposures(
         values = [np.append(position, quaternion_from_matrix(turn)) for turn, position in exterior]
         rows += _rows([fluoroscope.name], numbers, values, 9)
     header = ('fluoroscope', 'exposure', 'x_mm', 'y_mm', 'z_mm', 'qw', 'qx', 'qy', 'qz')
-    write_table(directory / TRUTH / f'{name}_exposures.csv', header, rows)
+    Table(header, rows).write(directory / TRUTH / f'{name}_exposures.csv')
 
 
 def write_radiographs(
@@ -156,7 +156,7 @@ def write_radiographs(
             done += 1
             if progress is not None:
                 progress(done, total)
-    write_table(directory / TRUTH / 'images.csv', OBSERVATION_COLUMNS, rows)
+    Table(OBSERVATION_COLUMNS, rows).write(directory / TRUTH / 'images.csv')
 
 
 def write_marker_radiographs(
@@ -189,12 +189,9 @@ def write_marker_radiographs(
             write_observations_csv(directory / FIRST_MARKERS, _first_markers(views, markers))
         if progress is not None:
             progress(number * len(names), sequence.frames * len(names))
-    write_table(directory / TRUTH / 'marker_images.csv', (*OBSERVATION_COLUMNS, 'seen'), rows)
-    write_table(
-        directory / TRUTH / 'marker_images_points.csv',
-        ('exposure', 'target_id', 'x_mm', 'y_mm', 'z_mm'),
-        points,
-    )
+    Table((*OBSERVATION_COLUMNS, 'seen'), rows).write(directory / TRUTH / 'marker_images.csv')
+    columns = ('exposure', 'target_id', 'x_mm', 'y_mm', 'z_mm')
+    Table(columns, points).write(directory / TRUTH / 'marker_images_points.csv')
     clusters = [
         f'cluster_{number + 1}: {" ".join(map(str, markers.target_id[markers.cluster == number]))}'
         for number in range(markers.scene.clusters)
@@ -231,7 +228,7 @@ def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:
         for row in _rows([number], tracking.marker_id, points, 6)
     )
     header = ('frame', 'target_id', 'x_mm', 'y_mm', 'z_mm')
-    write_table(directory / TRUTH / 'markers.csv', header, rows)
+    Table(header, rows).write(directory / TRUTH / 'markers.csv')
 
 
 def write_knee(directory: PathLike, knee: VirtualKnee) -> None:
@@ -258,10 +255,10 @@ def write_knee_recording(directory: PathLike, name: str, recording: SimulatedKne
             [motion.times_s, motion.position_mm[body], wxyz[:, 1:], wxyz[:, :1]]
         )
         rows += _rows([body], numbers, values, 9)
-    write_table(directory / TRUTH / f'{name}_poses.csv', POSE_COLUMNS[:10], rows)
+    Table(POSE_COLUMNS[:10], rows).write(directory / TRUTH / f'{name}_poses.csv')
     values = np.column_stack([motion.times_s, np.rad2deg(motion.angles), motion.translations])
     rows = list(_rows([KNEE], numbers, values, 9))
-    write_table(directory / TRUTH / f'{name}_joints.csv', JOINT_COLUMNS[:9], rows)
+    Table(JOINT_COLUMNS[:9], rows).write(directory / TRUTH / f'{name}_joints.csv')
 
 
 def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) -> None:

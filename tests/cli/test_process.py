@@ -19,7 +19,7 @@ from fluoro_calib_ros import processes
 from fluoro_calib_ros.cli.process import STATE, Done, _Work, trial_row
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.calibration import load_calibration, rig_verdict, with_digests
-from fluoro_calib_ros.io.csv_table import write_table
+from fluoro_calib_ros.io.csv_table import Table
 from fluoro_calib_ros.io.rig_file import read_study
 
 STUDY = """
@@ -173,7 +173,7 @@ def test_a_trial_of_a_rig_that_has_moved_fails(study, forked):
     for row in rows:
         if row['fluoroscope'] == 'b':
             row['v'] = float(row['v']) + 10
-    write_table(path, rows[0], (row.values() for row in rows))
+    Table(tuple(rows[0]), (row.values() for row in rows)).write(path)
     assert run('process', study) == 3
     rows = rows_of(study)
     assert rows['trials/walk']['verdict'] == 'fail' and 'rays' in rows['trials/walk']['cause']

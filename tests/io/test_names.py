@@ -8,7 +8,7 @@ import pytest
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.names import MAX_ID, Names, number_names
 from fluoro_calib_ros.io import csv_table
-from fluoro_calib_ros.io.csv_table import NAMES_FILE, read_names, write_names, write_table
+from fluoro_calib_ros.io.csv_table import NAMES_FILE, Table, read_names, write_names
 
 NAMES = Names({'tib, lat': 4, 'fem "a"': 2}, {'trial 3.tif': 3}, {'Röntgen 1': 'R_ntgen_1'})
 
@@ -58,7 +58,7 @@ def test_a_name_that_a_spreadsheet_would_run_is_written_as_text_and_read_again(t
 
 def test_numbers_are_written_as_they_are(tmp_path):
     path = tmp_path / 'numbers.csv'
-    write_table(path, ['-1.5', 'name'], [[-1.5, '-1.5', '+2', '-inf', '-1e-05', 'nan', 'name', 3]])
+    Table(('-1.5', 'name'), [[-1.5, '-1.5', '+2', '-inf', '-1e-05', 'nan', 'name', 3]]).write(path)
     assert path.read_text() == '-1.5,name\n-1.5,-1.5,+2,-inf,-1e-05,nan,name,3\n'
 
 

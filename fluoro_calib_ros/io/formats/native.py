@@ -25,7 +25,7 @@ from ...photogrammetry.rig_orientation import KnownOrientation
 from ..access import PathLike, read_text, write_text
 from ..bodies import NAME_COLUMN
 from ..bodies import POINT_COLUMNS as POINTS
-from ..csv_table import has_columns, read_all, write_table
+from ..csv_table import Table, has_columns, read_all
 from ..documents import read_yaml
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
@@ -127,7 +127,7 @@ def _write_points(path: Path, content: Content, settings: FileSettings) -> Writt
     assert points is not None
     rate = settings.rate_hz or points.rate_hz
     rows = _point_rows(points, rate, content.names.target_names())
-    write_table(path, (*POINTS, NAME_COLUMN), rows)
+    Table((*POINTS, NAME_COLUMN), rows).write(path)
     note = f'{path}: standard deviations of the coordinates are not written, only coordinates'
     return Written((str(path),), (note,))
 
@@ -158,10 +158,8 @@ def _read_grid(path: Path, settings: FileSettings) -> Content:
 
 
 def _write_grid(path: Path, content: Content, settings: FileSettings) -> Written:
-    rows = (
-        [name, *map(repr, row)] for name, grid in content.grids.items() for row in grid.tolist()
-    )
-    write_table(path, GRID, rows)
+    rows = ([name, *row] for name, grid in content.grids.items() for row in grid.tolist())
+    Table(GRID, rows).write(path)
     return Written((str(path),))
 
 

@@ -56,7 +56,7 @@ from ..reconstruction.intersection import STATUS_NAMES as POINT_STATUS
 from ..reconstruction.reconstruct import ReconstructedFrame
 from .access import PathLike
 from .csv_table import Block, Table, read_blocks
-from .documents import read_toml
+from .documents import check_keys, numbers_of, read_toml
 
 BODY_COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
 
@@ -175,9 +175,8 @@ def read_joints(path: PathLike, bodies: Iterable[Body | str]) -> tuple[JointEntr
     Raises DataError that names file and joint.
     """
     document = read_toml(path)
-    tables = document.pop('joint', None)
-    for key in document:
-        raise DataError(f'{path}, key {key}: unknown, there are tables [[joint]]')
+    check_keys(path, document, ('joint',))
+    tables = document.get('joint')
     if not isinstance(tables, list) or not tables:
         raise DataError(f'{path}: the file has no table [[joint]]')
     if len(tables) > MAX_JOINTS:
@@ -196,9 +195,7 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
         raise DataError(f'{where}: this is not a table')
     if isinstance(table.get('name'), str) and table['name']:
         where = f'{path}, joint {table["name"]}'
-    for key in table:
-        if key not in KEYS:
-            raise DataError(f'{where}, key {key}: unknown, expected one of {", ".join(KEYS)}')
+    check_keys(where, table, KEYS)
     texts: dict[str, str] = {}
     for key in (*REQUIRED, 'side'):
         value = table.get(key, '' if key == 'side' else None)
@@ -266,45 +263,23 @@ def _frame_of(of: Convention, end: str, table: Mapping[str, Any], side: str) -> 
         kind = of.proximal_landmarks if end == 'proximal' else of.distal_landmarks
         if not kind:
             raise DataError(f'{of.name} has no landmarks for it, give axes or a neutral trial')
-        points = _table(table, 'landmarks')
-        return frame_of_landmarks(kind, {n: _array(n, x, (3,)) for n, x in points.items()}, side)
+        return frame_of_landmarks(kind, _points(table, 'landmarks'), side)
     if 'matrix' in table:
-        matrix = _array('matrix', table['matrix'], (4, 4))
+        matrix = numbers_of(end, table, 'matrix', (4, 4))
         if (matrix[3] != [0, 0, 0, 1]).any():
             raise DataError('the last row of the matrix is not 0, 0, 0, 1')
         return AnatomicalFrame(matrix[:3, :3], matrix[:3, 3])
-    origin = _array('origin', table['origin'], (3,))
+    origin = numbers_of(end, table, 'origin', (3,))
     if 'axes' in table:
-        axes = _table(table, 'axes')
-        return frame_of_axes({n: _array(n, x, (3,)) for n, x in axes.items()}, origin)
-    return frame_of_quaternion(_array('quaternion_wxyz', table['quaternion_wxyz'], (4,)), origin)
+        return frame_of_axes(_points(table, 'axes'), origin)
+    return frame_of_quaternion(numbers_of(end, table, 'quaternion_wxyz', (4,)), origin)
 
 
-def _table(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+def _points(table: Mapping[str, Any], key: str) -> dict[str, NDArray[np.float64]]:
+    """Return coordinates (3,) by name. Raises DataError."""
     if not isinstance(table[key], Mapping):
         raise DataError(f'{key} is not a table of names and coordinates')
-    return table[key]
-
-
-def _array(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return finite numbers of this shape. Raises DataError that names the key."""
-
-    def is_array(part: Any, size: Sequence[int]) -> bool:
-        if not size:
-            return type(part) in (int, float)
-        if not isinstance(part, list) or len(part) != size[0]:
-            return False
-        return all(is_array(item, size[1:]) for item in part)
-
-    if not is_array(value, shape):
-        raise DataError(f'{name} does not have {" x ".join(map(str, shape))} numbers')
-    try:
-        array = np.array(value, dtype=float)
-    except OverflowError:
-        array = np.array(np.inf)
-    if not np.isfinite(array).all():
-        raise DataError(f'{name} has a number that is not finite')
-    return array
+    return {name: numbers_of(key, table[key], name, (3,)) for name in table[key]}
 
 
 def joint_definition(

@@ -15,12 +15,13 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from ..errors import DataError
 from ..limits import DOCUMENT_BYTES, MAX_DEPTH
@@ -196,6 +197,42 @@ def _whole(value: str | int) -> int:
 
 def _not_finite(word: str) -> NoReturn:
     raise ValueError(f'{word} is not a number of JSON')
+
+
+def numbers_of(
+    where: object, table: Mapping[Any, Any], key: str, shape: tuple[int, ...] | None = None
+) -> NDArray[np.float64]:
+    """Return an entry of a document as an array of finite numbers, of this shape unless None.
+
+    Raises DataError, whose message begins with where, also for a number that is written as text.
+    """
+    if key not in table:
+        raise DataError(f'{where}: there is no {key}')
+    are_numbers = _are_numbers(table[key])
+    if not are_numbers and not shape:
+        raise DataError(f'{where}: {key} does not consist of numbers')
+    try:
+        array = np.array(table[key] if are_numbers else None, dtype=float)
+    except ValueError:  # rows of different lengths
+        array = np.array(np.nan)
+    if shape is not None and array.shape != shape:
+        raise DataError(f'{where}: {key} does not have {" x ".join(map(str, shape))} numbers')
+    if not np.isfinite(array).all():
+        raise DataError(f'{where}: {key} has a number that is not finite')
+    return array
+
+
+def _are_numbers(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(map(_are_numbers, value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def check_keys(where: object, table: Mapping[Any, Any], keys: Collection[str]) -> None:
+    """Raise DataError, whose message begins with where, for an unknown key."""
+    for key in table:
+        if key not in keys:
+            raise DataError(f'{where}, key {key}: unknown, expected one of {", ".join(keys)}')
 
 
 # Results written as JSON files.

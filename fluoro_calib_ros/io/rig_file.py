@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DataError
-from .documents import read_toml
+from .documents import check_keys, read_toml
 
 NAME = 'rig.toml'
 MAX_ABOUT_TEXT = 1000  # maximum length of a key with its text, in characters
@@ -61,7 +61,7 @@ KEYS = tuple(field.name for field in fields(RigFile)[1:])
 def read_rig_file(path: Path) -> RigFile:
     """Read a rig.toml. Raises DataError that names file and key."""
     document = read_toml(path)
-    _check_keys(path, document, KEYS)
+    check_keys(path, document, KEYS)
     for key, (is_valid, expected) in _EXPECTED.items():
         if key in document and not is_valid(document[key]):
             raise DataError(f'{path}, key {key}: expected {expected}')
@@ -171,13 +171,6 @@ def _checked_path(path: Path, key: str, value: Any, example: str) -> Path:
     return Path(value)
 
 
-def _check_keys(path: Path, document: Mapping[str, Any], keys: Sequence[str]) -> None:
-    """Raise DataError for an unknown key."""
-    for key in document:
-        if key not in keys:
-            raise DataError(f'{path}, key {key}: unknown, expected one of {", ".join(keys)}')
-
-
 # study.toml: a calibration and the trials that use it, for `fluoro-calib process`.
 #
 #     trials = ["trials/*"]         # recordings: bags, files of image points, or radiographs
@@ -235,7 +228,7 @@ def read_study(path: Path) -> StudyFile:
     path = path / STUDY if path.is_dir() else path
     document = read_toml(path)
     keys = ('trials', 'out', 'calibration', CALIBRATE, *OF_TRIALS, CONVERT)
-    _check_keys(path, document, keys)
+    check_keys(path, document, keys)
     tables = {key: _table(path, key, document[key]) for key in keys[3:] if key in document}
     out = _checked_path(path, 'out', document.get('out', OUT), OUT)
     if 'calibration' in document:

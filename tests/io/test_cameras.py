@@ -384,3 +384,15 @@ def test_file_of_another_format_says_what_it_looks_like(tmp_path):
     (tmp_path / 'x.json').write_text(json.dumps({}))
     with pytest.raises(DataError, match='the format is not known'):
         registry.read(tmp_path / 'x.json', MM)
+
+
+@pytest.mark.parametrize('value', ['"12.5"', 'true'])
+def test_numbers_of_a_camera_are_not_texts_or_flags(tmp_path, value):
+    """A text that numpy would convert, and true as 1, are slips of a person."""
+    path = tmp_path / 'calibration.toml'
+    registry.write(path, 'anipose', Content(cameras=cameras()[:1]), MM)
+    lines = path.read_text().splitlines()
+    lines = [f'translation = [1.0, {value}, 2.0]' if 'translation' in n else n for n in lines]
+    path.write_text('\n'.join(lines))
+    with pytest.raises(DataError, match='translation does not have 3 numbers'):
+        registry.read(path, MM)

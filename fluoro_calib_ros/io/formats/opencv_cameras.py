@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from ..access import PathLike, read_text, write_text
-from ..documents import check_budget, read_toml, read_yaml
+from ..documents import check_budget, numbers_of, read_toml, read_yaml
 from .content import (
     Camera,
     Content,
@@ -185,35 +185,18 @@ def _read_anipose(path: Path, settings: FileSettings) -> Content:
 def _anipose_camera(where: str, table: Mapping[str, Any], mm: float) -> Camera:
     if table.get('fisheye'):
         raise DataError(f'{where}: fisheye cameras are not supported')
-    matrix = _numbers_of(where, table, 'matrix', (3, 3))
+    matrix = numbers_of(where, table, 'matrix', (3, 3))
     check_matrix(where, matrix)
-    size = _size(where, _numbers_of(where, table, 'size', (2,)))
-    distortion = _numbers_of(where, table, 'distortions', None).ravel()
+    size = _size(where, numbers_of(where, table, 'size', (2,)))
+    distortion = numbers_of(where, table, 'distortions').ravel()
     return Camera(
         str(table.get('name', where)),
         matrix,
         image_size=size,
-        rotation=matrix_from_vector(_numbers_of(where, table, 'rotation', (3,))),
-        translation_mm=from_units(_numbers_of(where, table, 'translation', (3,)), mm),
+        rotation=matrix_from_vector(numbers_of(where, table, 'rotation', (3,))),
+        translation_mm=from_units(numbers_of(where, table, 'translation', (3,)), mm),
         distortion=tuple(distortion.tolist()) if distortion.any() else (),
     )
-
-
-def _numbers_of(
-    where: object, table: Mapping[str, Any], key: str, shape: tuple[int, ...] | None
-) -> NDArray[np.float64]:
-    """Return an entry of a document as an array of finite numbers. Raises DataError."""
-    try:
-        value = np.array(table[key], dtype=float)
-    except KeyError:
-        raise DataError(f'{where}: there is no {key}') from None
-    except (TypeError, ValueError, OverflowError):
-        raise DataError(f'{where}: {key} does not consist of numbers') from None
-    if shape is not None and value.shape != shape:
-        raise DataError(f'{where}: {key} has {value.shape} numbers, not {shape}')
-    if not np.isfinite(value).all():
-        raise DataError(f'{where}: {key} has a number that is not finite')
-    return value
 
 
 def _size(where: object, values: NDArray[np.float64]) -> tuple[int, int]:
@@ -291,7 +274,7 @@ def _read_camera_info(path: Path, settings: FileSettings) -> Content:
         raise DataError(f'{path}: this is not a camera_info, it has no entries')
     matrix = _entry_matrix(path, document, 'camera_matrix', (3, 3))
     check_matrix(path, matrix)
-    size = [_numbers_of(path, document, key, ()) for key in ('image_width', 'image_height')]
+    size = [numbers_of(path, document, key, ()) for key in ('image_width', 'image_height')]
     image_size = _size(path, np.array(size))
     model = document.get('distortion_model', _MODELS[0])
     distortion = np.zeros(0)
@@ -315,7 +298,7 @@ def _entry_matrix(
     entry = document.get(key)
     if not isinstance(entry, Mapping):
         raise DataError(f'{path}: there is no {key} with rows, cols and data')
-    data = _numbers_of(f'{path}, {key}', entry, 'data', None)
+    data = numbers_of(f'{path}, {key}', entry, 'data')
     rows = entry.get('rows')
     columns = entry.get('cols')
     if type(rows) is not int or type(columns) is not int or data.size != rows * columns:

@@ -18,6 +18,7 @@ import posixpath
 import sys
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -40,39 +41,34 @@ from .tables import Row, default_name, frame_of, named_targets, table_of
 def read(path: Path, settings: FileSettings) -> Content:
     """Read the wanted parts of a project. Raises DataError."""
     with ProjectArchive(path) as archive:
-        return _content(_Project(archive, settings))
+        return _content(_Project(archive, settings), settings)
 
 
-def _content(project: _Project) -> Content:
+def _content(project: _Project, settings: FileSettings) -> Content:
     """Return the wanted parts of an open project."""
-    settings = project.settings
     wanted = settings.wanted
     survey = project.survey()
-    names = Names(
-        survey.names.targets,
-        {},
-        {name: i for name, i in project.ids.items() if name != i},
-    )
+    fluoroscopes = {name: i for name, i in project.ids.items() if name != i}
+    names = Names(survey.names.targets, {}, fluoroscopes)
     parts: dict[str, Any] = {'notes': survey.notes if 'survey' in wanted else ()}
     if 'survey' in wanted:
         parts['survey'] = survey.survey
     if 'observations' in wanted:
         if settings.trial is None:
-            observations, exposures = _Observations(project, survey).of_phantom()
+            observations, exposures = _phantom_frames(project, survey)
             names = Names(names.targets, exposures, names.fluoroscopes)
         else:
-            observations, targets = _Observations(project, survey).of_trial()
+            observations, targets = _trial_frames(project, survey)
             names = Names(targets, {}, names.fluoroscopes)
         parts['observations'] = observations
-    calibration = _Calibration(project)
     if 'stations' in wanted or 'cameras' in wanted:
-        mm, notes = settings.unit_or('cm', str(project.archive.path))
-        stations = tuple(calibration.stations(mm))
+        mm, notes = settings.unit_or('cm', str(project.path))
+        stations = tuple(_stations(project, mm))
         parts['stations'] = stations
-        parts['cameras'] = tuple(calibration.cameras(stations))
+        parts['cameras'] = tuple(_cameras(project, stations))
         parts['notes'] += notes
     if 'grids' in wanted:
-        parts['grids'] = dict(calibration.grids())
+        parts['grids'] = dict(_grids(project))
     return Content(names=names, **parts)
 
 
@@ -87,6 +83,7 @@ class _Project:
 
     def __init__(self, archive: ProjectArchive, settings: FileSettings) -> None:
         self.archive = archive
+        self.path = archive.path
         self.settings = settings
         self.cameras = archive.root.findall('Camera')
         if not self.cameras:
@@ -111,7 +108,7 @@ class _Project:
         if not name:
             return Content()
         return content_of(
-            Path(f'{self.archive.path}, {name}'), self.archive.member_text(name), self.settings
+            Path(f'{self.path}, {name}'), self.archive.member_text(name), self.settings
         )
 
     def images(self, camera: ElementTree.Element) -> Iterator[tuple[int, ElementTree.Element]]:
@@ -129,7 +126,7 @@ class _Project:
                 return self.archive.whole(image, 'Width'), self.archive.whole(image, 'Height')
             name = self.archive.text(image, 'Filename')
             size = declared_size(memoryview(self.archive.member(name)))
-            with ErrorsAt(f'{self.archive.path}: {name}'):
+            with ErrorsAt(f'{self.path}: {name}'):
                 check_size(*size)
             if min(size) > 0:
                 return size
@@ -137,7 +134,7 @@ class _Project:
         given = self.settings.size_of(self.ids[name])
         if given is None:
             raise DataError(
-                f'{self.archive.path}: the project does not contain the image size of '
+                f'{self.path}: the project does not contain the image size of '
                 f'{name}, --image-size WxH is needed'
             )
         return given
@@ -149,203 +146,177 @@ class _Project:
             return trials[self.settings.trial or '']
         except KeyError:
             raise DataError(
-                f'{self.archive.path}: there is no trial {self.settings.trial!r}, only '
+                f'{self.path}: there is no trial {self.settings.trial!r}, only '
                 f'{", ".join(trials) or "none"}'
             ) from None
 
 
-class _Part:
-    """Base class of the readers of parts of a project."""
-
-    def __init__(self, project: _Project) -> None:
-        self._project = project
-        self._settings = project.settings
-        self._files = project.archive
-        self._path = project.archive.path
-
-
-class _Observations(_Part):
-    """Image points of a project, of the calibration object or the markers of a trial."""
-
-    def __init__(self, project: _Project, survey: Content) -> None:
-        super().__init__(project)
-        self._survey = survey
-
-    def of_phantom(self) -> tuple[dict[str, list[Frame]], dict[str, int]]:
-        """Return the frames of the calibration object, and the numbers of its named exposures."""
-        frames: dict[str, list[Frame]] = {}
-        exposures: dict[str, int] = {}
-        for camera, name in self._project.named():
-            size = self._project.image_size(camera)
-            for number, image in self._project.images(camera):
-                file = posixpath.basename(image.get('Filename', '').replace('\\', '/'))
-                if file not in ('', 'external') and number not in exposures.values():
-                    exposures[file] = number
-                if _is_set(image):
-                    frame = self._calibration_frame(image, name, number, size)
-                    if len(frame.target_id):
-                        frames.setdefault(name, []).append(frame)
-        if not frames:
-            raise DataError(f'{self._path}: the project has no calibrated images with points')
-        return frames, without_trivial(exposures)
-
-    def _calibration_frame(
-        self,
-        image: ElementTree.Element,
-        name: str,
-        number: int,
-        size: tuple[int, int],
-    ) -> Frame:
-        """Return the points of a calibration image that XMALab used."""
-        file = self._files.file_of(image, 'PointsDetected')
-        uv = self._files.numbers(file)
-        inlier = self._files.numbers(self._files.file_of(image, 'Inlier'))
-        survey = self._survey.survey
-        count = len(uv) if survey is None else len(survey.target_id)
-        if uv.shape[1:] != (2,) or len(uv) != count or inlier.shape != (count, 1):
-            raise DataError(
-                f'{self._path}, {file}: {len(uv)} points and {len(inlier)} inliers, but the '
-                f'calibration object has {count} beads'
-            )
-        used = (inlier[:, 0] == 1) & ~(uv == -1).all(axis=1)  # -1, -1: not found
-        points = (self._bead_ids(count)[used], uv[used])
-        return frame_of(f'{self._path}, {file}', name, number, *points, size)
-
-    def _bead_ids(self, count: int) -> NDArray[np.int64]:
-        """Return the ids of the beads in the order of the frame specification."""
-        if self._survey.names.targets:
-            return np.array(list(self._survey.names.targets.values()), dtype=np.int64)
-        return np.arange(1, count + 1)
-
-    def of_trial(self) -> tuple[dict[str, list[Frame]], dict[str, int]]:
-        """Return the frames of the markers of a trial, and the ids of the markers by name."""
-        trial = self._project.trial()
-        markers = trial.findall('Marker')
-        if not markers:
-            raise DataError(f'{self._path}: the trial {self._settings.trial!r} has no markers')
-        labels = [
-            marker.get('Description') or default_name(self._files.whole(marker, 'ID') + 1)
-            for marker in markers
-        ]
-        known_targets = self._settings.names.targets or self._survey.names.targets
-        ids = number_names(labels, known_targets)
-        if len(set(labels)) < len(labels):
-            repeated = next(name for name in labels if labels.count(name) > 1)
-            raise DataError(f'{self._path}: two markers of the trial are called {repeated!r}')
-        count = len(self._project.cameras)
-        tables = []
-        for marker in markers:
-            uv = self._files.numbers(self._files.text(marker, 'FilenamePoints2D'))
-            status = self._files.numbers(self._files.text(marker, 'FilenameStatus2D'))
-            if uv.shape != (len(status), 2 * count) or status.shape[1] != count:
-                raise DataError(
-                    f'{self._path}, {self._files.text(marker, "FilenamePoints2D")}: {uv.shape[1]} '
-                    f'columns, but there are {count} cameras'
-                )
-            uv = uv.reshape(len(uv), count, 2)
-            tables.append(np.where((status > 0)[..., None], uv, np.nan))  # 0: not seen
-        if len({len(table) for table in tables}) > 1:
-            raise DataError(f'{self._path}: the markers of the trial have different frames')
-        target_id = np.array([ids[name] for name in labels], dtype=np.int64)
-        points = np.stack(tables, axis=2)  # frame, camera, marker
-        frames: dict[str, list[Frame]] = {}
-        for column, (camera, name) in enumerate(self._project.named()):
-            size = self._project.image_size(camera)
-            for number, uv in enumerate(points[:, column], 1):
-                is_seen = ~np.isnan(uv).any(axis=1)
-                if is_seen.any():
-                    where = f'{self._path}, trial {self._settings.trial}, frame {number}'
-                    seen_id, seen_uv = target_id[is_seen], uv[is_seen]
-                    frame = frame_of(where, name, number, seen_id, seen_uv, image_size=size)
+def _phantom_frames(
+    project: _Project, survey: Content
+) -> tuple[dict[str, list[Frame]], dict[str, int]]:
+    """Return the frames of the calibration object, and the numbers of its named exposures."""
+    frames: dict[str, list[Frame]] = {}
+    exposures: dict[str, int] = {}
+    for camera, name in project.named():
+        size = project.image_size(camera)
+        for number, image in project.images(camera):
+            file = posixpath.basename(image.get('Filename', '').replace('\\', '/'))
+            if file not in ('', 'external') and number not in exposures.values():
+                exposures[file] = number
+            if _is_set(image):
+                place, target_id, uv = _points_of_image(project, survey, image)
+                if len(target_id):
+                    frame = frame_of(place, name, number, target_id, uv, size)
                     frames.setdefault(name, []).append(frame)
-        return frames, named_targets(ids)
+    if not frames:
+        raise DataError(f'{project.path}: the project has no calibrated images with points')
+    return frames, without_trivial(exposures)
 
 
-class _Calibration(_Part):
-    """Calibrated cameras of a project, their poses and undistortion grids."""
-
-    def stations(self, mm: float) -> Iterator[Station]:
-        """Yield the pose of every calibrated image."""
-        for camera, name in self._project.named():
-            for number, image in self._project.images(camera):
-                if not _is_set(image):
-                    continue
-                file = self._files.file_of(image, 'RotationMatrix')
-                rotation = self._files.numbers(file)
-                translation = self._files.numbers(
-                    self._files.file_of(image, 'TranslationVector')
-                ).ravel()
-                if rotation.shape != (3, 3) or translation.shape != (3,):
-                    raise DataError(f'{self._path}, {file}: this is not a pose')
-                check_rotation(f'{self._path}, {file}', rotation)
-                yield Station(name, number, rotation, -rotation.T @ translation * mm)
-
-    def cameras(self, stations: tuple[Station, ...]) -> Iterator[Camera]:
-        """Yield the calibrated cameras in the frame of the calibration object.
-
-        The poses are those of the reference image of the chosen trial, otherwise of the first
-        image in which all cameras are calibrated.
-        """
-        calibrated = [(camera, name) for camera, name in self._project.named() if _is_set(camera)]
-        reference = self._reference(stations, [name for _, name in calibrated])
-        for camera, name in calibrated:
-            file = self._files.text(camera, 'CameraMatrix')
-            matrix = self._files.numbers(file)
-            if matrix.shape != (3, 3):
-                raise DataError(f'{self._path}, {file}: this is not a camera matrix')
-            check_matrix(f'{self._path}, {file}', matrix)
-            distortion: tuple[float, ...] = ()
-            if camera.get('UndistortionParameter'):
-                distortion = tuple(
-                    self._files.numbers(self._files.text(camera, 'UndistortionParameter'))
-                    .ravel()
-                    .tolist()
-                )
-            size = self._project.image_size(camera)
-            for station in stations:
-                if (station.fluoroscope, station.exposure) == (name, reference):
-                    translation = -station.rotation @ station.position_mm
-                    yield Camera(
-                        name,
-                        matrix,
-                        image_size=size,
-                        rotation=station.rotation,
-                        translation_mm=translation,
-                        distortion=distortion,
-                    )
-                    break
-            else:
-                yield Camera(name, matrix, size, distortion=distortion)
-
-    def _reference(self, stations: tuple[Station, ...], names: list[str]) -> int | None:
-        """Return the exposure from which the poses of the cameras are taken."""
-        if self._settings.trial is not None:
-            return self._files.whole(self._project.trial(), 'referenceCalibration') + 1
-        by_exposure: dict[int, set[str]] = {}
-        for station in stations:
-            by_exposure.setdefault(station.exposure, set()).add(station.fluoroscope)
-        return min(
-            (e for e, fluoroscopes in by_exposure.items() if fluoroscopes >= set(names)),
-            default=None,
+def _points_of_image(
+    project: _Project, survey: Content, image: ElementTree.Element
+) -> tuple[str, NDArray[np.int64], NDArray[np.float64]]:
+    """Return place, ids (n,) and points (n, 2) of a calibration image that XMALab used."""
+    files = project.archive
+    file = files.file_of(image, 'PointsDetected')
+    uv = files.numbers(file)
+    inlier = files.numbers(files.file_of(image, 'Inlier'))
+    count = len(uv) if survey.survey is None else len(survey.survey.target_id)
+    if uv.shape[1:] != (2,) or len(uv) != count or inlier.shape != (count, 1):
+        raise DataError(
+            f'{project.path}, {file}: {len(uv)} points and {len(inlier)} inliers, but the '
+            f'calibration object has {count} beads'
         )
+    # Ids in the order of the frame specification.
+    ids = np.array(list(survey.names.targets.values()) or range(1, count + 1), dtype=np.int64)
+    used = (inlier[:, 0] == 1) & ~(uv == -1).all(axis=1)  # -1, -1: not found
+    return f'{project.path}, {file}', ids[used], uv[used]
 
-    def grids(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
-        """Yield the grid points that XMALab used: observed u, v and reference u, v."""
-        for camera, name in self._project.named():
-            grid = camera.find('UndistortionGrid')
-            if grid is None or not _is_set(grid, 'isComputed'):
+
+def _trial_frames(
+    project: _Project, survey: Content
+) -> tuple[dict[str, list[Frame]], dict[str, int]]:
+    """Return the frames of the markers of a trial, and the ids of the markers by name."""
+    files = project.archive
+    trial = project.trial()
+    where = f'{project.path}, trial {project.settings.trial}'
+    markers = trial.findall('Marker')
+    if not markers:
+        raise DataError(f'{project.path}: the trial {project.settings.trial!r} has no markers')
+    labels = [
+        marker.get('Description') or default_name(files.whole(marker, 'ID') + 1)
+        for marker in markers
+    ]
+    ids = number_names(labels, project.settings.names.targets or survey.names.targets)
+    if len(set(labels)) < len(labels):
+        repeated = next(name for name in labels if labels.count(name) > 1)
+        raise DataError(f'{project.path}: two markers of the trial are called {repeated!r}')
+    tables = [_points_of_marker(project, marker) for marker in markers]
+    if len({len(table) for table in tables}) > 1:
+        raise DataError(f'{project.path}: the markers of the trial have different frames')
+    target_id = np.array([ids[name] for name in labels], dtype=np.int64)
+    points = np.stack(tables, axis=2)  # frame, camera, marker
+    frames: dict[str, list[Frame]] = {}
+    for column, (camera, name) in enumerate(project.named()):
+        size = project.image_size(camera)
+        for number, uv in enumerate(points[:, column], 1):
+            seen = ~np.isnan(uv).any(axis=1)
+            if seen.any():
+                place = f'{where}, frame {number}'
+                frame = frame_of(place, name, number, target_id[seen], uv[seen], size)
+                frames.setdefault(name, []).append(frame)
+    return frames, named_targets(ids)
+
+
+def _points_of_marker(project: _Project, marker: ElementTree.Element) -> NDArray[np.float64]:
+    """Return the points of a marker by frame and camera (m, c, 2), NaN where not seen."""
+    files = project.archive
+    count = len(project.cameras)
+    uv = files.numbers(files.text(marker, 'FilenamePoints2D'))
+    status = files.numbers(files.text(marker, 'FilenameStatus2D'))
+    if uv.shape != (len(status), 2 * count) or status.shape[1] != count:
+        raise DataError(
+            f'{project.path}, {files.text(marker, "FilenamePoints2D")}: {uv.shape[1]} columns, '
+            f'but there are {count} cameras'
+        )
+    return np.where((status > 0)[..., None], uv.reshape(len(uv), count, 2), np.nan)
+
+
+def _stations(project: _Project, mm: float) -> Iterator[Station]:
+    """Yield the pose of every calibrated image."""
+    files = project.archive
+    for camera, name in project.named():
+        for number, image in project.images(camera):
+            if not _is_set(image):
                 continue
-            observed = self._files.numbers(self._files.file_of(grid, 'GridPointsDistorted'))
-            reference = self._files.numbers(self._files.file_of(grid, 'GridPointsReferences'))
-            inlier = self._files.numbers(self._files.file_of(grid, 'GridPointsInlier'))
-            if not observed.shape == reference.shape == (len(inlier), 2):
-                label = self._files.text(camera, 'Name')
-                raise DataError(
-                    f'{self._path}: the undistortion grid of {label} has {len(observed)}, '
-                    f'{len(reference)} and {len(inlier)} points'
-                )
-            used = inlier[:, 0] == 1
-            yield name, np.hstack([observed, reference])[used]
+            file = files.file_of(image, 'RotationMatrix')
+            rotation = files.numbers(file)
+            translation = files.numbers(files.file_of(image, 'TranslationVector')).ravel()
+            if rotation.shape != (3, 3) or translation.shape != (3,):
+                raise DataError(f'{project.path}, {file}: this is not a pose')
+            check_rotation(f'{project.path}, {file}', rotation)
+            yield Station(name, number, rotation, -rotation.T @ translation * mm)
+
+
+def _cameras(project: _Project, stations: tuple[Station, ...]) -> Iterator[Camera]:
+    """Yield the calibrated cameras in the frame of the calibration object.
+
+    The poses are those of the reference image of the chosen trial, otherwise of the first image
+    in which all cameras are calibrated.
+    """
+    files = project.archive
+    calibrated = [(camera, name) for camera, name in project.named() if _is_set(camera)]
+    reference = _reference(project, stations, {name for _, name in calibrated})
+    poses = {s.fluoroscope: s for s in reversed(stations) if s.exposure == reference}
+    for camera, name in calibrated:
+        file = files.text(camera, 'CameraMatrix')
+        matrix = files.numbers(file)
+        if matrix.shape != (3, 3):
+            raise DataError(f'{project.path}, {file}: this is not a camera matrix')
+        check_matrix(f'{project.path}, {file}', matrix)
+        distortion: tuple[float, ...] = ()
+        if camera.get('UndistortionParameter'):
+            parameters = files.numbers(files.text(camera, 'UndistortionParameter'))
+            distortion = tuple(parameters.ravel().tolist())
+        size = project.image_size(camera)
+        unposed = Camera(name, matrix, size, distortion=distortion)
+        if name not in poses:
+            yield unposed
+            continue
+        rotation = poses[name].rotation
+        translation = -rotation @ poses[name].position_mm
+        yield replace(unposed, rotation=rotation, translation_mm=translation)
+
+
+def _reference(
+    project: _Project, stations: tuple[Station, ...], fluoroscopes: set[str]
+) -> int | None:
+    """Return the exposure from which the poses of the cameras are taken."""
+    if project.settings.trial is not None:
+        return project.archive.whole(project.trial(), 'referenceCalibration') + 1
+    by_exposure: dict[int, set[str]] = {}
+    for station in stations:
+        by_exposure.setdefault(station.exposure, set()).add(station.fluoroscope)
+    return min((e for e, names in by_exposure.items() if names >= fluoroscopes), default=None)
+
+
+def _grids(project: _Project) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Yield the grid points that XMALab used: observed u, v and reference u, v."""
+    files = project.archive
+    for camera, name in project.named():
+        grid = camera.find('UndistortionGrid')
+        if grid is None or not _is_set(grid, 'isComputed'):
+            continue
+        observed, reference, inlier = (
+            files.numbers(files.file_of(grid, f'GridPoints{part}'))
+            for part in ('Distorted', 'References', 'Inlier')
+        )
+        if not observed.shape == reference.shape == (len(inlier), 2):
+            raise DataError(
+                f'{project.path}: the undistortion grid of {files.text(camera, "Name")} has '
+                f'{len(observed)}, {len(reference)} and {len(inlier)} points'
+            )
+        yield name, np.hstack([observed, reference])[inlier[:, 0] == 1]
 
 
 FORMAT = Format(

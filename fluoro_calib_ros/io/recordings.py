@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, ErrorsAt
 from ..images.codec import check_size
 from ..limits import MAX_FRAMES
-from .access import check_regular_file, opened, os_errors
+from .access import opened, os_errors
 
 # Supported transfer syntaxes (PS3.5, annex A): implicit and explicit little endian, explicit big
 # endian, RLE. Deflated files are refused, as their decompressed size is unbounded.
@@ -66,21 +66,15 @@ def read_dicom_header(path: Path) -> DicomHeader:
     but grey images of 8 or 16 bits, uncompressed or run-length encoded.
     """
     pydicom = _pydicom()
-    check_regular_file(path)
-    if not os.path.isfile(path):
-        raise DataError('there is no such file', at=path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore')
-            dataset = pydicom.dcmread(path, stop_before_pixels=True)
-            header = _dicom_header(dataset, os.path.getsize(path))
-    except DataError as error:
-        raise error.at(path) from None
-    except OSError as error:
-        raise DataError(f'cannot be read ({error.strerror or error})', at=path) from None
-    except Exception:  # pydicom raises various exceptions for damaged files
-        raise DataError('this is not a DICOM file, or it is damaged', at=path) from None
-    return header
+    with ErrorsAt(path), opened(path) as file, warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        try:
+            dataset = pydicom.dcmread(file, stop_before_pixels=True)
+            return _dicom_header(dataset, os.fstat(file.fileno()).st_size)
+        except (DataError, OSError):
+            raise
+        except Exception:  # pydicom raises various exceptions for damaged files
+            raise DataError('this is not a DICOM file, or it is damaged') from None
 
 
 # Tags of the tube load with their units in mAs, finest first (PS3.3, X-Ray Acquisition).

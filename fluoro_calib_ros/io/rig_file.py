@@ -65,22 +65,17 @@ def read_rig_file(path: Path) -> RigFile:
     for key, (is_valid, expected) in _EXPECTED.items():
         if key in document and not is_valid(document[key]):
             raise DataError(f'{path}, key {key}: expected {expected}')
-    names = document.get('fluoroscopes')
-    size = document.get('image_size')
-    sd = document.get('phantom_sd')
-    max_age = document.get('angle_max_age')
-    return RigFile(
-        path,
-        names,
-        image_size=None if size is None else (size[0], size[1]),
-        phantom=_path(path, 'phantom', document.get('phantom')),
-        calibration=_path(path, 'calibration', document.get('calibration')),
-        units=document.get('units'),
-        phantom_sd=None if sd is None else float(sd),
-        angle_joint=_joint(path, document.get('angle_joint'), names),
-        angle_max_age=None if max_age is None else float(max_age),
-        about=_about(path, document['about']) if 'about' in document else None,
-    )
+    convert: dict[str, Callable[[Any], Any]] = {
+        'image_size': tuple,
+        'phantom': lambda value: path.parent / _path(path, 'phantom', value),
+        'calibration': lambda value: path.parent / _path(path, 'calibration', value),
+        'phantom_sd': float,
+        'angle_joint': lambda value: _joint(path, value, document.get('fluoroscopes')),
+        'angle_max_age': float,
+        'about': lambda value: _about(path, value),
+    }
+    values = {key: convert.get(key, lambda value: value)(document[key]) for key in document}
+    return RigFile(path, **values)
 
 
 def _are_names(value: Any) -> bool:
@@ -121,12 +116,10 @@ _EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
 }
 
 
-def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:
+def _joint(path: Path, value: Any, names: list[str] | None) -> str:
     """Return the option angle_joint; names: fluoroscopes of the rig, None for any."""
     from ..exposures.angles import joints_by_fluoroscope  # every command loads this module
 
-    if value is None:
-        return None
     where = f'{path}, key angle_joint'
     example = (
         'expected a joint, such as "carm", or one for each fluoroscope, such as {a = "frontal"}'
@@ -161,11 +154,7 @@ def _about(path: Path, value: Mapping[str, Any]) -> dict[str, str]:
     return {key: str(text) for key, text in value.items()}
 
 
-def _path(path: Path, key: str, value: Any) -> Path | None:
-    return None if value is None else path.parent / _checked_path(path, key, value, 'phantom.csv')
-
-
-def _checked_path(path: Path, key: str, value: Any, example: str) -> Path:
+def _path(path: Path, key: str, value: Any, example: str = 'phantom.csv') -> Path:
     if not isinstance(value, str) or not value or '\0' in value:
         raise DataError(f'{path}, key {key}: expected a path, such as "{example}"')
     return Path(value)
@@ -230,9 +219,9 @@ def read_study(path: Path) -> StudyFile:
     keys = ('trials', 'out', 'calibration', CALIBRATE, *OF_TRIALS, CONVERT)
     check_keys(path, document, keys)
     tables = {key: _table(path, key, document[key]) for key in keys[3:] if key in document}
-    out = _checked_path(path, 'out', document.get('out', OUT), OUT)
+    out = _path(path, 'out', document.get('out', OUT), OUT)
     if 'calibration' in document:
-        calibration = _checked_path(path, 'calibration', document['calibration'], OUT)
+        calibration = _path(path, 'calibration', document['calibration'], OUT)
     else:
         calibration = out / 'calibration'
     if (CALIBRATE in tables) == ('calibration' in document):

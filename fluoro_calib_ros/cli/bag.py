@@ -167,6 +167,7 @@ def _info_text(report: BagReport, faults: list[str]) -> str:
 
 
 def _topic_document(topic: TopicReport) -> dict[str, Any]:
+    counts = ('backward_jumps', 'missing_frames', 'repeated_frames', 'restarts', 'undecodable')
     return {
         'type': topic.type,
         'messages': len(topic.log_ns),
@@ -174,11 +175,7 @@ def _topic_document(topic: TopicReport) -> dict[str, Any]:
         'end_ns': max(topic.log_ns),
         'rate_hz': 1e9 / topic.interval_ns if topic.interval_ns > 0 else None,
         'longest_gap_s': topic.longest_gap_s,
-        'backward_jumps': topic.backward_jumps,
-        'missing_frames': topic.missing_frames,
-        'repeated_frames': topic.repeated_frames,
-        'restarts': topic.restarts,
-        'undecodable': topic.undecodable,
+        **{name: getattr(topic, name) for name in counts},
     }
 
 

@@ -41,7 +41,6 @@ from fluoro_calib_ros.io.bags.salvage import (
     Recovery,
     Salvage,
     TopicReport,
-    _faults,
     _is_whole,
     _looks_like_chunk,
     _read_header,
@@ -99,14 +98,14 @@ def test_frame_numbers_that_are_missing_repeated_or_begin_again():
     one = report(numbers=[1, 2, 2, 5, 1, 2, 4, 4, 4])
     assert (one.missing_frames, one.repeated_frames, one.restarts) == (3, 3, 1)
     assert (report(numbers=[3]).missing_frames, report().restarts) == (0, 0)
-    texts = _faults(one)
+    texts = one.faults
     assert [text.split()[0] for text in texts] == ['3', '3', 'the'] and 'once' in texts[2]
-    assert _faults(report(numbers=[1, 2])) == []
-    (text,) = _faults(report(numbers=[1, 3]))
+    assert report(numbers=[1, 2]).faults == []
+    (text,) = report(numbers=[1, 3]).faults
     assert text.startswith('1 frame is')
     gap = report([0, 0, 0, 500], [0, 20, 40, 540])
-    assert _faults(gap)[0].startswith('a gap of 0.500 s, the usual interval is 20.0 ms')
-    assert _faults(TopicReport('x', undecodable=2))[0].startswith('2 messages')
+    assert gap.faults[0].startswith('a gap of 0.500 s, the usual interval is 20.0 ms')
+    assert TopicReport('x', undecodable=2).faults[0].startswith('2 messages')
 
 
 def cdr(order, sec, nanosec, frame_id, number):

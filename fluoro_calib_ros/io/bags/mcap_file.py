@@ -10,9 +10,10 @@ import os
 import re
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
@@ -78,35 +79,21 @@ class ChannelInfo:
         return parse_profiles(self.channel.metadata.get('offered_qos_profiles', ''))
 
 
-@dataclass
-class _Scan:
-    """Result of a pass over all records of a file, by id."""
-
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    ordered: bool = True  # whether messages are in the order of log time
-
-
 def channels_of_file(path: str) -> list[ChannelInfo]:
     """Return all channels of a file. Raises DataError for a damaged file."""
     with _open_checked(path) as file:
         summary = _complete_summary(file)
         if summary is not None and summary.statistics is not None:
-            schemas = summary.schemas
-            channels = summary.channels
             counts = summary.statistics.channel_message_counts
         else:
-            scan = _scan(file)
-            schemas = scan.schemas
-            channels = scan.channels
-            counts = scan.counts
+            summary, counts, _ = _scan(file)
+        channels = summary.channels
         if len(channels) > MAX_TOPICS:
             raise DataError(
                 f'{path}: the bag has {len(channels)} channels; the limit is {MAX_TOPICS}'
             )
         return [
-            ChannelInfo(channel, schemas.get(channel.schema_id), counts.get(number, 0))
+            ChannelInfo(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
             for number, channel in channels.items()
         ]
 
@@ -185,7 +172,6 @@ def _indexed_messages(
     file: BinaryIO, summary: Summary, topics: Collection[str] | None
 ) -> Iterator[BagMessage]:
     """Yield the messages of a file by its chunk index in the order of log time."""
-    types = {number: schema.name for number, schema in summary.schemas.items()}
     wanted = {
         number
         for number, channel in summary.channels.items()
@@ -201,12 +187,14 @@ def _indexed_messages(
     while queue:
         _, offset, _, message = heapq.heappop(queue)
         if message is not None:
-            channel = summary.channels[message.channel_id]
-            msg_type = types.get(channel.schema_id, '')
-            yield BagMessage(channel.topic, msg_type, message.log_time, message.data)
+            yield _message(summary, message)
             continue
         file.seek(offset)
-        for number, record in enumerate(_records_of_chunk(file)):
+        limits: dict[str, Any] = {'emit_chunks': True, 'record_size_limit': MAX_RECORD}
+        chunk = next(StreamReader(file, skip_magic=True, **limits).records)
+        if not isinstance(chunk, Chunk):
+            raise DataError(f'{file.name}: the bag is damaged, its index names no chunk')
+        for number, record in enumerate(_broken_up(file.name, chunk)):
             if isinstance(record, Message) and record.channel_id not in summary.channels:
                 raise DataError(
                     f'{file.name}: the bag is damaged, the topic of messages is unknown'
@@ -220,32 +208,42 @@ def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Itera
 
     They are read sequentially if they are in this order, otherwise sorted in memory.
     """
-    scan = _scan(file)
-    types = {number: schema.name for number, schema in scan.schemas.items()}
+    summary, _, ordered = _scan(file)
     messages = (
-        BagMessage(channel.topic, types.get(channel.schema_id, ''), record.log_time, record.data)
+        _message(summary, record)
         for record in _records(file)
         if isinstance(record, Message)
-        for channel in (scan.channels[record.channel_id],)
-        if topics is None or channel.topic in topics
+        if topics is None or summary.channels[record.channel_id].topic in topics
     )
-    yield from messages if scan.ordered else sorted(messages, key=lambda m: m.log_time_ns)
+    yield from messages if ordered else sorted(messages, key=lambda m: m.log_time_ns)
 
 
-def _scan(file: BinaryIO) -> _Scan:
-    """Read all records of a file to collect its channels and message counts."""
-    scan = _Scan()
+def _message(summary: Summary, message: Message) -> BagMessage:
+    channel = summary.channels[message.channel_id]
+    schema = summary.schemas.get(channel.schema_id)
+    return BagMessage(channel.topic, schema.name if schema else '', message.log_time, message.data)
+
+
+def _scan(file: BinaryIO) -> tuple[Summary, Counter[int], bool]:
+    """Read all records of a file.
+
+    Returns its schemas and channels, the number of messages by channel, and whether they are in
+    the order of log time.
+    """
+    summary = Summary()
+    counts: Counter[int] = Counter()
+    is_ordered = True
     last_ns = 0
     for record in _records(file):
         if isinstance(record, Schema):
-            scan.schemas[record.id] = record
+            summary.schemas[record.id] = record
         elif isinstance(record, Channel):
-            scan.channels[record.id] = record
+            summary.channels[record.id] = record
         elif isinstance(record, Message):
-            scan.counts[record.channel_id] = scan.counts.get(record.channel_id, 0) + 1
-            scan.ordered = scan.ordered and record.log_time >= last_ns
+            counts[record.channel_id] += 1
+            is_ordered = is_ordered and record.log_time >= last_ns
             last_ns = record.log_time
-    return scan
+    return summary, counts, is_ordered
 
 
 def _records(file: BinaryIO) -> Iterator[McapRecord]:
@@ -257,15 +255,6 @@ def _records(file: BinaryIO) -> Iterator[McapRecord]:
             yield from _broken_up(file.name, record)
         else:
             yield record
-
-
-def _records_of_chunk(file: BinaryIO) -> list[McapRecord]:
-    """Return the records of the chunk at the position of a file. Raises DataError."""
-    reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=MAX_RECORD)
-    record = next(reader.records)
-    if not isinstance(record, Chunk):
-        raise DataError(f'{file.name}: the bag is damaged, its index names no chunk')
-    return _broken_up(file.name, record)
 
 
 def _broken_up(path: str, chunk: Chunk) -> list[McapRecord]:
@@ -345,29 +334,20 @@ def _beginning(path: PathLike) -> bytes:
     return b''
 
 
-def storage_files(source: PathLike) -> list[str]:
+def storage_files(source: PathLike, damaged: bool = False) -> list[str]:
     """Return the paths of the .mcap files of a bag, in order.
 
-    For a folder these are the files listed in metadata.yaml; without metadata.yaml all .mcap
-    files, in the order of their numbers. Raises DataError for a source that is not a bag.
+    For a folder these are the files listed in metadata.yaml; without metadata.yaml, or if the bag
+    is damaged, all .mcap files, in the order of their numbers. Raises DataError for a source that
+    is not a bag.
     """
     if not os.path.lexists(source):
         raise DataError(f'{source}: there is no such bag')
     if not os.path.isdir(source):
         return [os.fspath(source)]
-    if os.path.lexists(os.path.join(source, METADATA)):
+    if not damaged and os.path.lexists(os.path.join(source, METADATA)):
         return _listed_files(source)
     return _files_in(source)
-
-
-def candidate_files(source: PathLike) -> list[str]:
-    """Return the paths of the .mcap files of a damaged bag; its metadata.yaml is ignored.
-
-    Raises DataError for a source that is not a bag.
-    """
-    if not os.path.lexists(source):
-        raise DataError(f'{source}: there is no such bag')
-    return _files_in(source) if os.path.isdir(source) else [os.fspath(source)]
 
 
 def _files_in(source: PathLike) -> list[str]:
@@ -378,14 +358,12 @@ def _files_in(source: PathLike) -> list[str]:
         raise DataError(
             f'{source}: this folder is not a bag, it has neither metadata.yaml nor an .mcap file'
         )
-    return [os.path.join(source, name) for name in sorted(names, key=_natural_order)]
 
+    def key(name: str) -> list[tuple[int, str]]:  # bag_9 before bag_10
+        parts = re.split(r'([0-9]+)', name)
+        return [(int(part), '') if part.isdigit() else (-1, part) for part in parts]
 
-def _natural_order(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that orders bag_9 before bag_10."""
-    return [
-        (int(part), '') if part.isdigit() else (-1, part) for part in re.split(r'([0-9]+)', name)
-    ]
+    return [os.path.join(source, name) for name in sorted(names, key=key)]
 
 
 def bag_information(folder: PathLike) -> dict[str, Any]:
@@ -451,9 +429,13 @@ def channels_of_bag(source: PathLike) -> list[ChannelInfo]:
                 raise DataError(f'{source}: the bag is damaged, the name of a topic is not a text')
             metadata = {'topic_type_hash': connection.digest or ''}
             profiles = getattr(connection.ext, 'offered_qos_profiles', '')
-            metadata['offered_qos_profiles'] = (
-                profiles if isinstance(profiles, str) else to_yaml(_plain(profiles))
-            )
+            if not isinstance(profiles, str):
+                # rosbags has converted some to objects
+                is_plain = isinstance(profiles, list) and all(
+                    isinstance(p, dict) for p in profiles
+                )
+                profiles = to_yaml(profiles if is_plain else [])
+            metadata['offered_qos_profiles'] = profiles
             encoding = getattr(connection.ext, 'serialization_format', 'cdr')
             channel = Channel(number, connection.topic, encoding, metadata, number)
             schema = Schema(number, text.encode(), 'ros2msg', connection.msgtype)
@@ -468,13 +450,6 @@ def messages_of_bag(source: PathLike, topics: Collection[str] | None) -> Iterato
         if connections:
             for connection, time_ns, data in bag.messages(connections):
                 yield BagMessage(connection.topic, connection.msgtype, time_ns, bytes(data))
-
-
-def _plain(profiles: object) -> list[object]:
-    """Return QoS profiles as in YAML, [] if rosbags has converted them to objects."""
-    if isinstance(profiles, list) and all(isinstance(item, dict) for item in profiles):
-        return profiles
-    return []
 
 
 @contextmanager

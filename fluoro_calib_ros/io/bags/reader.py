@@ -273,16 +273,16 @@ def _check_definitions(source: PathLike, topics: Collection[str]) -> None:
         for info in channels:
             if info.channel.topic not in topics:
                 continue
+            encoding = info.channel.message_encoding
             with ErrorsAt(f'{path}, topic {info.channel.topic}'):
-                _check_definition(info)
-
-
-def _check_definition(info: ChannelInfo) -> None:
-    encoding = info.channel.message_encoding
-    if encoding != 'cdr':
-        raise DataError(f'the messages are encoded as {encoding!r}, only cdr is supported')
-    if not _is_same_definition(info.definition):
-        raise DataError(f'the bag defines {TARGET_OBSERVATIONS} differently from this program')
+                if encoding != 'cdr':
+                    raise DataError(
+                        f'the messages are encoded as {encoding!r}, only cdr is supported'
+                    )
+                if not _is_same_definition(info.definition):
+                    raise DataError(
+                        f'the bag defines {TARGET_OBSERVATIONS} differently from this program'
+                    )
 
 
 def _is_same_definition(recorded: Definition) -> bool:
@@ -331,8 +331,9 @@ def image_topics(source: PathLike) -> dict[str, str]:
     remain.
     """
     topics: dict[str, dict[str, str]] = {}  # by fluoroscope and name without suffix
+    infos = topics_of(source)
     for kind in (COMPRESSED_IMAGE, IMAGE):
-        for topic, info in topics_of(source).items():
+        for topic, info in infos.items():
             base = topic.removesuffix('/compressed')
             parts = [part for part in base.split('/') if part]
             is_own = len(parts) > 1 and parts[-1] in OWN_IMAGES

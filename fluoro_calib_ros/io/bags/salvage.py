@@ -35,8 +35,8 @@ from .mcap_file import (
     RECORD,
     ChannelInfo,
     bag_information,
-    candidate_files,
     decompressed,
+    storage_files,
 )
 from .metadata import (
     PACKAGE,
@@ -60,7 +60,6 @@ class SalvagedMessage(NamedTuple):
     topic: str
     log_time_ns: int
     publish_time_ns: int
-    sequence: int
     data: bytes
 
 
@@ -75,11 +74,6 @@ class Damage:
     end_ns: int | None
     #: number of lost messages by topic; empty if unknown
     lost: dict[str, int] = field(default_factory=dict)
-
-
-class _Chunk(NamedTuple):
-    content: bytes | memoryview
-    end: int  # position after the chunk
 
 
 class FileSalvage:
@@ -126,9 +120,9 @@ class FileSalvage:
             if end is None or data[position] == Opcode.CHUNK or _looks_like_chunk(data, position):
                 chunk = _chunk_at(data, position)
                 if chunk is not None:
-                    for opcode, start, stop in _records_of(chunk.content):
-                        yield from self._record(opcode, bytes(chunk.content[start:stop]))
-                    position = chunk.end
+                    content, position = chunk
+                    for opcode, start, stop in _records_of(content):
+                        yield from self._record(opcode, content[start:stop])
                     continue
                 self._note_lost_chunk(data, position, end)
                 position = self._next_chunk(data, position + 1)
@@ -167,7 +161,7 @@ class FileSalvage:
     def _record(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage]:
         """Yield the message if the record is one; store schemas and channels."""
         if opcode == Opcode.MESSAGE and len(content) >= _MESSAGE.size:
-            number, sequence, received, sent = _MESSAGE.unpack_from(content)
+            number, _, received, sent = _MESSAGE.unpack_from(content)
             topic = self._topic(number)
             if topic is None:
                 self._note('the topic of messages is unknown', {'(unknown)': 1})
@@ -175,7 +169,7 @@ class FileSalvage:
             self._close_damage(received)
             self._last_ns = received
             self.counts[topic] += 1
-            yield SalvagedMessage(topic, received, sent, sequence, content[_MESSAGE.size :])
+            yield SalvagedMessage(topic, received, sent, content[_MESSAGE.size :])
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._define(opcode, content)
 
@@ -278,8 +272,8 @@ def _looks_like_chunk(data: mmap.mmap, position: int) -> bool:
     return data[start : start + 8].startswith((b'\x04\0\0\0zstd', b'\x03\0\0\0lz4'))
 
 
-def _chunk_at(data: mmap.mmap, position: int) -> _Chunk | None:
-    """Return the content of the chunk at a position, None unless it is intact.
+def _chunk_at(data: mmap.mmap, position: int) -> tuple[bytes, int] | None:
+    """Return the content of the chunk at a position and its end, None unless it is intact.
 
     Its length is taken from its own fields: opcode and length of the record may be damaged.
     """
@@ -299,11 +293,9 @@ def _chunk_at(data: mmap.mmap, position: int) -> _Chunk | None:
     if position + length > len(data):
         return None
     content = _decompressed(compression, memoryview(data)[position : position + length], size)
-    if content is None or not content:
+    if not content or (checksum and zlib.crc32(content) != checksum):
         return None
-    if checksum and zlib.crc32(content) != checksum:
-        return None
-    return _Chunk(content, position + length) if checksum or _is_whole(content) else None
+    return (content, position + length) if checksum or _is_whole(content) else None
 
 
 def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | None:
@@ -348,7 +340,7 @@ class Salvage:
     """The intact messages of a bag, file by file; topics and damages of the parts read so far."""
 
     def __init__(self, source: PathLike) -> None:
-        self.files = [FileSalvage(path) for path in candidate_files(source)]
+        self.files = [FileSalvage(path) for path in storage_files(source, damaged=True)]
         self._metadata = _expected_of_metadata(source)
 
     def messages(self) -> Iterator[tuple[FileSalvage, SalvagedMessage]]:
@@ -494,6 +486,28 @@ class TopicReport:
         steps = np.diff(self.numbers)
         return int((steps[steps > 1] - 1).sum())
 
+    @property
+    def faults(self) -> list[str]:
+        """Sentences about everything that is wrong."""
+        faults = []
+        if self.has_gap:
+            faults.append(
+                f'a gap of {self.longest_gap_s:.3f} s, the usual interval is '
+                f'{self.interval_ns * 1e-6:.1f} ms'
+            )
+        if self.backward_jumps:
+            faults.append(f'the clock runs backwards {_times(self.backward_jumps)}')
+        if self.missing_frames:
+            noun = 'frame is' if self.missing_frames == 1 else 'frames are'
+            faults.append(f'{self.missing_frames} {noun} missing in the frame numbers')
+        if self.repeated_frames:
+            faults.append(f'{self.repeated_frames} frame numbers are repeated')
+        if self.restarts:
+            faults.append(f'the frame numbers restart {_times(self.restarts)}')
+        if self.undecodable:
+            faults.append(f'{self.undecodable} messages are too short for their type')
+        return faults
+
 
 @dataclass(frozen=True)
 class BagReport:
@@ -512,7 +526,7 @@ class BagReport:
         faults = [f'{d.path}: {d.cause}' for d in self.damages]
         faults += [f'{topic}: {count} messages are lost' for topic, count in self.lost.items()]
         for topic, report in self.topics.items():
-            faults += [f'{topic}: {text}' for text in _faults(report)]
+            faults += [f'{topic}: {text}' for text in report.faults]
         faults += [
             f'fluoroscope {name}: {count} {"frame" if count == 1 else "frames"} without partner'
             for name, count in self.without_partner.items()
@@ -575,27 +589,6 @@ def _without_partner(topics: Mapping[str, TopicReport]) -> dict[str, int]:
     for counter in numbers.values():
         common &= counter
     return {name: (counter - common).total() for name, counter in sorted(numbers.items())}
-
-
-def _faults(report: TopicReport) -> list[str]:
-    faults = []
-    if report.has_gap:
-        faults.append(
-            f'a gap of {report.longest_gap_s:.3f} s, the usual interval is '
-            f'{report.interval_ns * 1e-6:.1f} ms'
-        )
-    if report.backward_jumps:
-        faults.append(f'the clock runs backwards {_times(report.backward_jumps)}')
-    if report.missing_frames:
-        noun = 'frame is' if report.missing_frames == 1 else 'frames are'
-        faults.append(f'{report.missing_frames} {noun} missing in the frame numbers')
-    if report.repeated_frames:
-        faults.append(f'{report.repeated_frames} frame numbers are repeated')
-    if report.restarts:
-        faults.append(f'the frame numbers restart {_times(report.restarts)}')
-    if report.undecodable:
-        faults.append(f'{report.undecodable} messages are too short for their type')
-    return faults
 
 
 def _times(count: int) -> str:

@@ -18,32 +18,16 @@ _KEY = 'option'
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """One option of an options class.
-
-    Parameters
-    ----------
-    name : str
-    default : object
-    description : str
-        One phrase, without unit, range and choices.
-    choices : tuple of str
-        Empty if any value in the range is allowed.
-    minimum, maximum : float or None
-        Range, including both ends.
-    unit : str
-        Such as 's' or 'px'; empty for a number without a unit.
-    length : int or None
-        Number of components of a tuple.
-    """
+    """One option of an options class."""
 
     name: str
     default: Any
-    description: str
-    choices: tuple[str, ...] = ()
-    minimum: float | None = None
-    maximum: float | None = None
-    unit: str = ''
-    length: int | None = None
+    description: str  #: one phrase, without unit, range and choices
+    choices: tuple[str, ...] = ()  #: empty if any value in the range is allowed
+    minimum: float | None = None  #: end of the range, included
+    maximum: float | None = None  #: end of the range, included
+    unit: str = ''  #: such as 's' or 'px'; empty for a number without a unit
+    length: int | None = None  #: number of components of a tuple
 
     @property
     def help(self) -> str:

@@ -11,8 +11,6 @@ same bytes.
 from __future__ import annotations
 
 import io
-import math
-import re
 import struct
 import sys
 import zipfile
@@ -28,15 +26,6 @@ from ..errors import DataError
 from ..limits import read_limits
 from .access import PathLike, atomic_file, read_bytes
 
-# Beginning of an .npy file, versions 1 to 3, of plain numbers or text (numpy.lib.format). numpy
-# evaluates the header as Python, which raises almost anything for a crafted one.
-_HEADER = re.compile(
-    rb'\x93NUMPY[\x01\x02\x03]\0(.{2}|.{4})\{'
-    rb"'descr': '([<>|=]?(?:b1|[iu][1248]|f[248]|U[0-9]{1,6}))', "
-    rb"'fortran_order': (True|False), "
-    rb"'shape': \(((?:[0-9]{1,18}, ?)*(?:[0-9]{1,18})?)\), ?\} *\n",
-    re.DOTALL,
-)
 _DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?')}
 
 
@@ -169,35 +158,25 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
 
 
 def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """Return an array of an archive. Raises DataError unless it contains plain numbers or text.
-
-    The header is compared with the size of the member before an array is created.
-    """
+    """Return an array of an archive. Raises DataError unless it contains plain numbers or text."""
     info = archive.getinfo(f'{name}.npy')
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise DataError(f'{path}: the array {name} is compressed in a way that numpy does not use')
     content = archive.read(info)
-    match = _HEADER.match(content)
-    if match is None:
-        raise _no_plain_array(path, name)
-    length, descr, order, shape_text = match.groups()
-    offset = match.end(1) + int.from_bytes(length, 'little')
-    dtype = np.dtype(descr.decode())
-    shape = tuple(int(number) for number in shape_text.split(b',') if number.strip())
-    # The product of Python integers does not overflow.
-    if not dtype.itemsize or math.prod(shape) * dtype.itemsize != len(content) - offset:
-        raise _no_plain_array(path, name)
+    stream = io.BytesIO(content)
     try:
-        array = np.frombuffer(content, dtype, offset=offset)
-        array = array.reshape(shape, order='F' if order == b'True' else 'C')
-    except ValueError:
+        array = np.lib.format.read_array(stream, allow_pickle=False)
+    except Exception:  # numpy evaluates the header as Python, which raises almost anything
         raise _no_plain_array(path, name) from None
-    if dtype.kind == 'U':
-        codes = np.frombuffer(content, np.dtype('u4').newbyteorder(dtype.byteorder), offset=offset)
+    is_plain = array.dtype.kind in 'biufU' and array.dtype.itemsize
+    if not is_plain or stream.tell() < len(content):
+        raise _no_plain_array(path, name)
+    if array.dtype.kind == 'U':
+        codes = np.frombuffer(array.tobytes(), f'{array.dtype.str[0]}u4')
         is_surrogate = (codes >> 11) == 0xD800 >> 11
         if ((codes > sys.maxunicode) | is_surrogate).any():  # not valid characters
             raise _no_plain_array(path, name)
-    return array.astype(dtype.newbyteorder('='))  # a writable copy
+    return array.astype(array.dtype.newbyteorder('='))  # a writable copy
 
 
 def _no_plain_array(path: PathLike, name: str) -> DataError:

@@ -29,7 +29,7 @@ from ..exposures.frame import Frames
 from ..findings import Finding, Kind, Place, Severity
 from ..limits import MAX_COINCIDENT, read_limits
 from ..photogrammetry.rig_orientation import RigOrientation
-from .access import PathLike, check_safe_name, make_folder, os_error_reason, read_bytes
+from .access import PathLike, check_safe_name, make_folder, os_errors, read_bytes
 from .arrays import Layout, read_arrays, to_arrays, to_values, write_arrays
 from .csv_table import NAMES_FILE
 from .documents import read_json, to_json_values
@@ -104,16 +104,12 @@ def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:
 
     Raises DataError if one cannot be read, or if the folder contains none.
     """
-    try:
-        names = sorted(
-            name for name in os.listdir(directory) if name.endswith(SUFFIX) and name[0] != '.'
-        )
-    except FileNotFoundError:
-        raise DataError(f'{directory}: there is no such folder') from None
-    except NotADirectoryError:
-        raise DataError(f'{directory}: this is a file, not a folder with calibrations') from None
-    except OSError as error:
-        raise DataError(f'{directory}: cannot be read ({os_error_reason(error)})') from None
+    if os.path.isfile(directory):
+        raise DataError(f'{directory}: this is a file, not a folder with calibrations')
+    if not os.path.exists(directory):
+        raise DataError(f'{directory}: there is no such folder')
+    with os_errors(directory, 'cannot be read'):
+        names = sorted(n for n in os.listdir(directory) if n.endswith(SUFFIX) and n[0] != '.')
     if not names:
         raise DataError(f'{directory}: there is no calibration in this folder (no file *{SUFFIX})')
     calibrations = {}
@@ -237,10 +233,7 @@ def load_orientation(path: PathLike) -> RigOrientation:
             f'{path}: the content does not belong to its orientation_id {identity}, '
             f'the file was changed'
         )
-    present_ids = _present_ids(path, orientation)
-    if present_ids == orientation.calibration_ids:
-        return orientation
-    return replace(orientation, calibration_ids=present_ids)
+    return replace(orientation, calibration_ids=_present_ids(path, orientation))
 
 
 def _check_oriented(path: Path) -> None:

@@ -22,7 +22,7 @@ from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..images.codec import JPEG_START
 from ..limits import MEGABYTE
-from .access import PathLike, check_safe_name, make_folder, read_bytes, write_bytes
+from .access import PathLike, check_safe_name, delete_file, make_folder, read_bytes, write_bytes
 from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .csv_table import read_names, write_names
 from .documents import read_json, write_json
@@ -55,7 +55,7 @@ def write_request(directory: PathLike, request: CalibrationRequest) -> None:
     if request.known_orientations:
         write_known_orientations(directory / KNOWN_ORIENTATION, request.known_orientations)
     else:
-        (directory / KNOWN_ORIENTATION).unlink(missing_ok=True)
+        delete_file(directory / KNOWN_ORIENTATION)
 
 
 def read_request(
@@ -136,14 +136,13 @@ def read_calibrated_frames(directory: Path, calibrations: Calibrations) -> dict[
         _require_file(path, '--source'), (max(widths), max(heights))
     )
     frames: dict[str, list[Frame]] = {}
-    for name, view_frames in all_frames.items():
-        if name in calibrations:
-            size = calibrations[name].image_size
-            frames[name] = [replace(frame, image_size=size) for frame in view_frames]
-    for view_frames in frames.values():
-        for frame in view_frames:
-            with ErrorsAt(path):
-                validate_frame(frame)
+    with ErrorsAt(path):
+        for name, view_frames in all_frames.items():
+            if name in calibrations:
+                size = calibrations[name].image_size
+                frames[name] = [replace(frame, image_size=size) for frame in view_frames]
+                for frame in frames[name]:
+                    validate_frame(frame)
     return frames
 
 

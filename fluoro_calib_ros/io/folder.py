@@ -63,15 +63,11 @@ class FolderKind:
 
     def owns(self, name: str) -> bool:
         """Return whether an entry belongs to the folder, or was left behind by a killed run."""
-        return _matches(name, (*self.parts, '.*.tmp'))
+        return any(fnmatchcase(name, pattern) for pattern in (*self.parts, '.*.tmp'))
 
     def is_marked_by(self, name: str) -> bool:
         """Return whether an entry of this name identifies a folder of this kind."""
-        return _matches(name, self.marks)
-
-
-def _matches(name: str, patterns: Iterable[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
+        return any(fnmatchcase(name, pattern) for pattern in self.marks)
 
 
 def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathLike] = ()) -> None:

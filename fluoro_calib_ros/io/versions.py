@@ -135,12 +135,10 @@ def read_learned_shapes(directory: PathLike) -> LearnedShapes:
                 end_ns=int(document['end_ns']),
                 exposures=int(document['exposures']),
             )
-        except (KeyError, TypeError, ValueError) as error:  # includes DataError
-            raise (
-                error
-                if isinstance(error, DataError)
-                else DataError(f'this is not a file of learned shapes ({error})')
-            ) from None
+        except DataError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f'this is not a file of learned shapes ({error})') from None
         check_bodies(learned.bodies)
     return learned
 

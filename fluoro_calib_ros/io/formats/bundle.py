@@ -256,10 +256,8 @@ class _Numbering:
 
     def __init__(self, names: Sequence[str], content: Content) -> None:
         self.camera = {name: number for number, name in enumerate(names, 1)}
-        exposures = [s.exposure for s in content.stations]
-        exposures += [
-            f.number for view_frames in (content.observations or {}).values() for f in view_frames
-        ]
+        frames = [f for view_frames in (content.observations or {}).values() for f in view_frames]
+        exposures = [*(s.exposure for s in content.stations), *(f.number for f in frames)]
         self._base = 0 if len(names) < 2 else 10 ** len(str(max(exposures, default=0)))
 
     def station(self, fluoroscope: str, exposure: int) -> int:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
@@ -365,21 +365,27 @@ class Format:
 # Helpers of the camera formats that have one file for each fluoroscope in a folder.
 
 
+def files_in_folder(folder: Path, names: Iterable[str], ending: str) -> dict[str, str]:
+    """Create a folder; return the paths of its files <fluoroscope><ending>. Raises DataError."""
+    names = list(names)
+    for name in names:
+        check_safe_name(name, folder)
+    make_folder(folder)
+    return {name: os.path.join(folder, name + ending) for name in names}
+
+
 def write_cameras(
     folder: Path, cameras: Sequence[Camera], ending: str, text_of: Callable[[Camera], str]
 ) -> tuple[str, ...]:
-    """Write a file <camera><ending> for each camera into a folder, once all texts are complete.
+    """Write a file for each camera into a folder, once all texts are complete.
 
     Returns the paths. Raises DataError.
     """
-    texts = {}
-    for camera in cameras:
-        check_safe_name(camera.name, folder)
-        texts[os.path.join(folder, camera.name + ending)] = text_of(camera)
-    make_folder(folder)
-    for path, text in texts.items():
-        write_text(path, text)
-    return tuple(texts)
+    texts = {camera.name: text_of(camera) for camera in cameras}
+    paths = files_in_folder(folder, texts, ending)
+    for name, path in paths.items():
+        write_text(path, texts[name])
+    return tuple(paths.values())
 
 
 def name_of_file(path: Path, ending: str) -> str:

@@ -25,7 +25,7 @@ from ...exposures.phantom import Phantom
 from ...findings import sentence_of
 from ...limits import read_limits
 from ..access import read_text, write_text
-from ..csv_table import decimal_comma_advice, decimal_point, is_number, without_zeros
+from ..csv_table import decimal_comma_advice, is_number, without_zeros
 from .content import UNITS_MM, Content, FileSettings, Format, Sample, Written, from_units, in_units
 from .tables import Row, check_labels, joined, separator_of, table_of
 
@@ -56,7 +56,7 @@ def _is_coordinates(sample: Sample) -> bool:
     if len(lines) < 2:
         return False
     separator = _separator(lines)
-    rows = [_cells(line, separator) for line in lines]
+    rows = [row.cells for row in table_of(sample.path, '\n'.join(lines), separator)]
     header = _header(rows[0])
     if header is not None:
         return len(rows[0]) <= MOST_CELLS
@@ -101,13 +101,6 @@ def _separator(lines: Sequence[str]) -> str:
     """Return the separator found in the second row, ' ' for blanks."""
     sample_line = lines[1] if len(lines) > 1 else ''.join(lines)
     return next((mark for mark in ';\t,' if mark in sample_line), ' ')
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    if separator == ' ':
-        return line.split()
-    cells = [cell.strip() for cell in line.split(separator)]
-    return [decimal_point(cell) for cell in cells] if separator == ';' else cells
 
 
 def _header(cells: Sequence[str]) -> _Layout | None:
@@ -231,11 +224,6 @@ def _is_framespec(sample: Sample) -> bool:
     return 3 <= len(bead.split(separator_of(bead))) <= 4 and 'target' not in header
 
 
-def _read_framespec(path: Path, settings: FileSettings) -> Content:
-    """Read the survey of a phantom. Raises DataError."""
-    return content_of(path, read_text(path), settings)
-
-
 def content_of(path: Path, text: str, settings: FileSettings) -> Content:
     """Return the survey in a text; path is for messages. Raises DataError."""
     # The header may have another separator than the beads.
@@ -307,7 +295,7 @@ FRAMESPEC = Format(
     'XMALab frame specification',
     parts=('survey',),
     recognise=_is_framespec,
-    read=_read_framespec,
+    read=lambda path, settings: content_of(path, read_text(path), settings),
     write=_write_framespec,
     says_units=False,
 )

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...exposures.frame import Frame
-from ..access import atomic_file, check_safe_name, make_folder, write_bytes
+from ..access import atomic_file, write_bytes
 from ..csv_table import as_text
-from .content import Content, FileSettings, Format, Sample, Written
+from .content import Content, FileSettings, Format, Sample, Written, files_in_folder
 from .reader_process import HDF5, hdf5_arrays, require_h5py
 from .tables import (
     Row,
@@ -144,19 +144,11 @@ def _frame_number(row: Row, first: int) -> int:
 
 def write_deeplabcut(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write a folder with a file <fluoroscope>.csv each, likelihood 1. Raises DataError."""
-    files = _files_of_cameras(path, content, '.csv')
-    for file, frames in files.items():
-        _write_camera(Path(file), frames, content.names.target_names())
-    return Written(tuple(files))
-
-
-def _files_of_cameras(path: Path, content: Content, ending: str) -> dict[str, Sequence[Frame]]:
-    """Create a folder; return the frames by the paths of their files in it. Raises DataError."""
     observations = content.observations or {}
-    for name in observations:
-        check_safe_name(name, path)
-    make_folder(path)
-    return {str(path / f'{name}{ending}'): frames for name, frames in observations.items()}
+    files = files_in_folder(path, observations, '.csv')
+    for name, frames in observations.items():
+        _write_camera(Path(files[name]), frames, content.names.target_names())
+    return Written(tuple(files.values()))
 
 
 def _write_camera(path: Path, frames: Sequence[Frame], named: dict[int, str]) -> None:
@@ -258,11 +250,12 @@ def _fluoroscope_of_video(path: Path, settings: FileSettings) -> str:
 def write_sleap(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write a folder with a file <fluoroscope>.analysis.h5 each. Raises DataError."""
     require_h5py(path)
-    files = _files_of_cameras(path, content, '.analysis.h5')
-    for file, frames in files.items():
-        check_row_count(file, max(frame.number for frame in frames))
-        write_bytes(file, _content_of(frames, content.names.target_names()))
-    return Written(tuple(files))
+    observations = content.observations or {}
+    files = files_in_folder(path, observations, '.analysis.h5')
+    for name, frames in observations.items():
+        check_row_count(files[name], max(frame.number for frame in frames))
+        write_bytes(files[name], _content_of(frames, content.names.target_names()))
+    return Written(tuple(files.values()))
 
 
 def _content_of(frames: Sequence[Frame], named: dict[int, str]) -> bytes:

@@ -21,7 +21,7 @@ cv2.remap takes the same map.
 
 from __future__ import annotations
 
-import os
+import io
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from ...errors import DataError, quoted
 from ...limits import MAX_IMAGE_SIDE
-from ..access import atomic_file, check_rows, check_safe_name, make_folder, read_text, write_text
+from ..access import atomic_file, check_rows, read_text, write_text
 from .content import (
     Y_UP_TO_DOWN,
     Camera,
@@ -43,6 +43,7 @@ from .content import (
     camera_at,
     check_matrix,
     check_rotation,
+    files_in_folder,
     from_units,
     in_units,
     name_of_file,
@@ -317,28 +318,22 @@ def read(path: Path, settings: FileSettings) -> Content:
     """Read a table; the fluoroscope is named after the file. Raises DataError."""
     text = read_text(path)
     check_rows(text, 2 * MAX_IMAGE_SIDE, path)
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
-    if not lines:
+    if not text.strip():
         raise DataError(f'{path}: the file has no rows')
     separator = separator_of(text)
-    if separator == ';':
-        lines = [(n, line.replace(',', '.')) for n, line in lines]
-    first_row = np.array(_float32_numbers(path, *lines[0], separator), dtype=np.float32)
-    if len(lines) % 2 or len(lines) < 2:
+    plain = io.StringIO(text.replace(',', '.') if separator == ';' else text)
+    try:
+        table = np.loadtxt(plain, np.float32, delimiter=separator, comments=None, ndmin=2)
+    except ValueError:
+        rows = read_table(path)
+        require_width(rows, len(rows[0].cells), 'the first row')
+        table = np.array([row.numbers() for row in rows], dtype=np.float32)
+    if len(table) % 2:
         raise DataError(
-            f'{path}: {len(lines)} rows, but a lookup table has as many for the rows as for the '
+            f'{path}: {len(table)} rows, but a lookup table has as many for the rows as for the '
             'columns of the map'
         )
-    table = np.empty((len(lines), len(first_row)), dtype=np.float32)
-    for index, (number, line) in enumerate(lines):
-        values = _float32_numbers(path, number, line, separator)
-        if len(values) != len(first_row):
-            raise DataError(
-                f'{path}, row {number}: {len(values)} columns, but the first row has '
-                f'{len(first_row)}'
-            )
-        table[index] = values
-    maps = table.reshape(2, -1, len(first_row))
+    maps = table.reshape(2, -1, table.shape[1])
     size = (maps.shape[2], maps.shape[1])
     name = name_of_file(path, ENDING)
     expected = settings.size_of(name) or size
@@ -351,28 +346,16 @@ def read(path: Path, settings: FileSettings) -> Content:
     return Content(lookups={name: maps})
 
 
-def _float32_numbers(path: Path, number: int, line: str, separator: str) -> list[float]:
-    cells = line.split(separator)
-    try:
-        return list(map(float, cells))
-    except ValueError:
-        return Row(path, number, [cell.strip() for cell in cells]).numbers()
-
-
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write a file <fluoroscope>_LUT.csv for each fluoroscope into the folder path."""
-    for name in content.lookups:
-        check_safe_name(name, path)
-    make_folder(path)
-    paths = []
+    paths = files_in_folder(path, content.lookups, ENDING)
     for name, maps in content.lookups.items():
-        paths.append(os.path.join(path, name + ENDING))
         table = np.where(np.isnan(maps).any(axis=0), np.float32(NOWHERE), maps)
-        with atomic_file(paths[-1], 'w') as file:
+        with atomic_file(paths[name], 'w') as file:
             for row in table.astype(np.float32).reshape(-1, table.shape[2]).tolist():
                 # Nine significant digits represent a float32 exactly.
                 file.write(', '.join([f'{value:.9g}' for value in row]) + '\n')
-    return Written(tuple(paths))
+    return Written(tuple(paths.values()))
 
 
 LOOKUP = Format(

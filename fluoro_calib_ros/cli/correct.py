@@ -117,6 +117,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _correct_points(arguments: argparse.Namespace, calibrations: Calibrations) -> None:
+    from ..correction.base import CorrectionStatus
     from ..io.observations import correct_points, write_points
     from ..jobs.sources import calibrated_settings, read_point_table
 
@@ -132,10 +133,7 @@ def _correct_points(arguments: argparse.Namespace, calibrations: Calibrations) -
     print_notes(notes)
     corrected = correct_points(points, calibrations, angle_of(arguments))
     write_points(arguments.out, points, corrected)
-    counts = {
-        name: int((corrected.status == status).sum())
-        for status, name in enumerate(('OK', 'OUTSIDE', 'INVALID'))
-    }
+    counts = {s.name: int((corrected.status == s).sum()) for s in CorrectionStatus}
     total = len(corrected.uv)
     by_status = ', '.join(f'{count} {name}' for name, count in counts.items())
     print_result(

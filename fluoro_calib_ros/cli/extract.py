@@ -31,7 +31,7 @@ from .output import ProgressBar, print_note, print_notes, print_result
 if TYPE_CHECKING:
     from ..exposures.frame import Frame
     from ..jobs.extraction import ExtractionOutcome
-    from ..jobs.marker_extraction import DoubtfulSpan, MarkerOutcome, MarkerRequest
+    from ..jobs.marker_extraction import MarkerOutcome, MarkerRequest
 
 NAME = 'extract'
 HELP = 'Find and measure the beads of a phantom in radiographs, or follow implanted markers.'
@@ -217,16 +217,19 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
     for result in outcome.refused:
         print_note(f'not used: {result.finding}')
     print_notes(outcome.notes)
-    print_result(arguments, _document(arguments.out, outcome), _text(arguments.out, outcome))
+    _print_phantom(arguments, outcome)
 
 
-def _document(out: Path, outcome: ExtractionOutcome) -> dict[str, Any]:
-    """Return the summary for --json."""
-    return {
+def _print_phantom(arguments: argparse.Namespace, outcome: ExtractionOutcome) -> None:
+    """Print the summary of the beads of a phantom."""
+    out = arguments.out
+    frames = outcome.frames
+    beads = sum(len(frame.target_id) for frame in frames)
+    document = {
         'out': str(out),
         'fluoroscope': outcome.fluoroscope,
         'images': len(outcome.results),
-        'observations': sum(len(frame.target_id) for frame in outcome.frames),
+        'observations': beads,
         'exposures': [
             {
                 'exposure': result.exposure,
@@ -243,16 +246,9 @@ def _document(out: Path, outcome: ExtractionOutcome) -> dict[str, Any]:
             for result in outcome.results
         ],
     }
-
-
-def _text(out: Path, outcome: ExtractionOutcome) -> str:
-    """Return the summary as text."""
-    frames = outcome.frames
-    beads = sum(len(frame.target_id) for frame in frames)
-    return (
-        f'{len(frames)} of {len(outcome.results)} images with {beads} beads, '
-        f'{beads / len(frames):.0f} an image\nwritten to {out}'
-    )
+    text = f'{len(frames)} of {len(outcome.results)} images with {beads} beads, '
+    text += f'{beads / len(frames):.0f} an image\nwritten to {out}'
+    print_result(arguments, document, text)
 
 
 def _run_markers(arguments: argparse.Namespace) -> None:
@@ -285,8 +281,15 @@ def _run_markers(arguments: argparse.Namespace) -> None:
                 f'{results[0].exposure}, for which the markers are given, are not used'
             )
     print_notes(outcome.notes)
-    for text in _doubt_texts(outcome.spans(), request):
-        print_note(text)
+    for span in outcome.spans():
+        name, *others = (
+            request.target_names.get(i, str(i)) for i in (span.target_id, *span.others)
+        )
+        doubt = f'may be {" or ".join(others) or "another object"}'
+        print_note(
+            f'fluoroscope {span.fluoroscope}: marker {name} {doubt} in exposures {span.first} to '
+            f'{span.last}: {span.reason}'
+        )
     doubtful = doubtful_ids(outcome)
     if doubtful:
         marker_names = Names({name: number for number, name in request.target_names.items()})
@@ -352,20 +355,6 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         target_names=target_names,
         angles=angles,
     )
-
-
-def _doubt_texts(spans: list[DoubtfulSpan], request: MarkerRequest) -> list[str]:
-    """Return a sentence for each id that may be wrong."""
-    texts = []
-    for span in spans:
-        name = request.target_names.get(span.target_id, str(span.target_id))
-        candidates = ' or '.join(request.target_names.get(i, str(i)) for i in span.others)
-        doubt = f'may be {candidates}' if candidates else 'may be another object'
-        texts.append(
-            f'fluoroscope {span.fluoroscope}: marker {name} {doubt} in exposures {span.first} to '
-            f'{span.last}: {span.reason}'
-        )
-    return texts
 
 
 def _marker_document(out: Path, outcome: MarkerOutcome) -> dict[str, Any]:

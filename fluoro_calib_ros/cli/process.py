@@ -194,66 +194,59 @@ def study_steps(study: StudyFile, parse: Parse) -> tuple[list[Step], dict[str, l
 
     The working directory must be the folder of the study. Raises DataError for an invalid option.
     """
-    make = _StepMaker(study, parse)
     calibration_steps = []
     if study.calibrate is not None:
-        source = str(study.calibrate[SOURCE])
-        calibration_steps.append(
-            make('', 'calibrate', study.calibrate, (source,), study.calibration)
-        )
+        words = ('', str(study.calibrate[SOURCE]), str(study.calibration))
+        calibration_steps.append(_step(study, parse, 'calibrate', study.calibrate, words))
     return calibration_steps, {
-        trial.name: list(_trial_steps(study, trial, make)) for trial in study.trials
+        trial.name: list(_trial_steps(study, trial, parse)) for trial in study.trials
     }
 
 
-def _trial_steps(study: StudyFile, trial: Trial, make: _StepMaker) -> Iterator[Step]:
+def _trial_steps(study: StudyFile, trial: Trial, parse: Parse) -> Iterator[Step]:
     """Yield the steps of a trial."""
     folder = study.out / trial.name
-    calibration = ('--calibration', str(study.calibration))
     source = str(trial.path)
     for command, name in (
         ('extract', 'observations.csv'),
         ('reconstruct', 'points.csv'),
         ('bodies', 'motion'),
     ):
-        if command not in study.commands:
-            continue
-        words = (source, *calibration)
-        yield make(trial.name, command, study.commands[command], words, folder / name)
-        if command == 'extract':
-            source = str(folder / name)
+        if command in study.commands:
+            out = str(folder / name)
+            words = (trial.name, source, '--calibration', str(study.calibration), out)
+            yield _step(study, parse, command, study.commands[command], words)
+            source = out if command == 'extract' else source
     for kind, options in study.convert.items():
-        words = (str(folder / 'points.csv'), '--to', kind)
-        yield make(trial.name, 'convert', options, words, folder / f'points.{kind}')
+        out = str(folder / f'points.{kind}')
+        words = (trial.name, str(folder / 'points.csv'), '--to', kind, out)
+        yield _step(study, parse, 'convert', options, words)
 
 
-class _StepMaker:
-    """Creates steps from the options of a study, checked by the parser of the command."""
+def _step(
+    study: StudyFile, parse: Parse, command: str, options: Options, words: Sequence[str]
+) -> Step:
+    """Return a step that the parser of its command has checked. Raises DataError.
 
-    def __init__(self, study: StudyFile, parse: Parse) -> None:
-        self._study = study
-        self._parse = parse
+    words: arguments that do not come from the options; the first is the name of the trial, and
+    the last the output.
+    """
+    trial, *given, out = words
 
-    def __call__(
-        self, trial: str, command: str, options: Options, words: Sequence[str], out: Path
-    ) -> Step:
-        """Return a step; words: arguments that do not come from the options. Raises DataError."""
-        where = f'{self._study.path}, table {command}'
+    def error(message: str) -> NoReturn:
+        raise DataError(f'{study.path}, table {command}: {message}')
 
-        def error(message: str) -> NoReturn:
-            raise DataError(f'{where}: {message}')
-
-        all_words = [command, *words, '--out', str(out)]
-        for key, value in options.items():
-            name = key.replace('-', '_')
-            if name in OF_PROCESS and (command, name) != ('calibrate', SOURCE):
-                error(f'the key {key} is set by the study')
-            if name != SOURCE:
-                all_words += _option_words(key, value, error)
-        arguments = self._parse(all_words, error)
-        paths = input_paths(arguments)
-        paths += [arguments.rig_file.path] if arguments.rig_file is not None else []
-        return Step(trial, tuple(all_words), tuple(paths), out)
+    all_words = [command, *given, '--out', out]
+    for key, value in options.items():
+        name = key.replace('-', '_')
+        if name in OF_PROCESS and (command, name) != ('calibrate', SOURCE):
+            error(f'the key {key} is set by the study')
+        if name != SOURCE:
+            all_words += _option_words(key, value, error)
+    arguments = parse(all_words, error)
+    paths = input_paths(arguments)
+    paths += [arguments.rig_file.path] if arguments.rig_file is not None else []
+    return Step(trial, tuple(all_words), tuple(paths), Path(out))
 
 
 def _option_words(key: str, value: Any, error: Callable[[str], NoReturn]) -> list[str]:

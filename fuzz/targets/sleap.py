@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from fluoro_calib_ros.exposures.frame import Frame, validate_frame
-from fluoro_calib_ros.io.formats import point_networks, reader_process
+from fluoro_calib_ros.io.formats import image_points, reader_process
 from fluoro_calib_ros.io.formats.content import Content, FileSettings
 
 from ..harness import Target
@@ -26,7 +26,7 @@ assert h5py  # import it before the forks
 
 def _read(path: Path) -> None:
     with mock.patch.object(reader_process, 'run_module', run_forked):
-        content = point_networks.read_sleap(path, SETTINGS)
+        content = image_points.read_sleap(path, SETTINGS)
     for frames in (content.observations or {}).values():
         for frame in frames:
             validate_frame(frame)
@@ -36,7 +36,7 @@ def _write(path: Path, count: int) -> None:
     uv = np.arange(4.0).reshape(2, 2)
     frames = [Frame('a', k, np.array([1, 2]), uv + k, SIZE) for k in range(count)]
     folder = path.with_name('cameras')
-    point_networks.write_sleap(folder, Content(observations={'a': frames}), SETTINGS)
+    image_points.write_sleap(folder, Content(observations={'a': frames}), SETTINGS)
     (folder / 'a.analysis.h5').rename(path)
 
 

@@ -830,9 +830,8 @@ def test_steps_depend_on_the_rig_file_whose_defaults_they_use(tmp_path, monkeypa
     study = Fake(path=tmp_path / 'study.toml')
 
     def digest():
-        words = ['walk.csv', '--calibration', 'result']
-        make = process._StepMaker(study, parse_words)
-        return process.digest_of(make('walk', 'reconstruct', {}, words, Path('points.csv')))
+        words = ['walk', 'walk.csv', '--calibration', 'result', 'points.csv']
+        return process.digest_of(process._step(study, parse_words, 'reconstruct', {}, words))
 
     without = digest()
     (tmp_path / 'rig.toml').write_text('units = "cm"')

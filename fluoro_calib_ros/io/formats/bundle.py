@@ -40,8 +40,8 @@ from .content import (
     in_units,
     refuse_distortion,
 )
+from .image_points import camera_order
 from .tables import Row, joined, read_table, require_width
-from .xmalab_points import camera_order
 
 NAME = 'bundle'  # name of the files written
 WIDTHS = {'.pho': 8, '.iop': 25, '.eop': 8, '.xyz': 7}

@@ -17,12 +17,12 @@ from ...errors import DataError, quoted
 from ...exposures.frame import Frame
 from ...exposures.names import Names
 from ..access import PathLike, encoding_of, kind_not_read, opened
-from . import bundle, native, xmalab_points, xmalab_project
+from . import bundle, native, xmalab_project
 from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
+from .image_points import DEEPLABCUT, SLEAP, XMALAB2D
 from .opencv_cameras import ANIPOSE, CAMERA_INFO, OPENCV
 from .phantoms import COORDINATES, FRAMESPEC
-from .point_networks import DEEPLABCUT, SLEAP
 from .points import C3D, TRC, XMALAB3D
 from .xmalab_cameras import DLT, LOOKUP, MAYACAM1, MAYACAM2
 
@@ -35,7 +35,7 @@ FORMATS: dict[str, Format] = {
     for format_ in (
         *native.FORMATS,
         native.KNOWN_ORIENTATION,
-        xmalab_points.FORMAT,
+        XMALAB2D,
         DEEPLABCUT,
         SLEAP,
         xmalab_project.FORMAT,

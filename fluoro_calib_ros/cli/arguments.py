@@ -143,7 +143,10 @@ def add_option(parser: Parser, option: Option, **changes: Any) -> None:
     """
     settings: dict[str, Any] = {'default': option.default}
     unit = f' [{option.unit}]' if option.unit else ''
-    default = '' if option.default is None else f' (default: {_text(option.default)})'
+    text = str(option.default)
+    if isinstance(option.default, tuple):
+        text = ','.join(f'{value:g}' for value in option.default)
+    default = '' if option.default is None else f' (default: {text})'
     settings['help'] = f'{option.description}{unit}{default}'
     if option.default is False:
         settings = {'action': 'store_true', 'help': option.description}
@@ -295,10 +298,6 @@ def add_read_limits(parser: argparse.ArgumentParser) -> None:
     add_options(group, ReadLimits, READ_LIMITS, **dict.fromkeys(READ_LIMITS, metavar))
 
 
-def _text(default: Any) -> str:
-    return ','.join(f'{v:g}' for v in default) if isinstance(default, tuple) else str(default)
-
-
 def add_source(
     parser: argparse.ArgumentParser, image_size_help: str, more: str = ''
 ) -> argparse._ArgumentGroup:
@@ -347,10 +346,17 @@ def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> No
 
 def add_angle_options(parser: Parser) -> None:
     """Add the options for the source of the angle of the C-arm in the exposures of a bag."""
-    from ..exposures.angles import AngleOptions
+    from ..exposures.angles import AngleOptions, joints_by_fluoroscope
+
+    def convert(text: str) -> str:
+        try:
+            joints_by_fluoroscope(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        return text
 
     joint = {
-        'type': _angle_joint,
+        'type': convert,
         'metavar': 'JOINT',
         'help': 'joint of the joint states in a bag whose position is the angle of the C-arm, or '
         f"one for each fluoroscope: A:JOINT,B:JOINT; '' for none (default: that of {NAME}, else "
@@ -367,17 +373,6 @@ def angle_options(arguments: argparse.Namespace) -> AngleOptions:
     return options_of(
         AngleOptions, arguments, angle_joint=str(joint), of_rig=isinstance(joint, JointOfRig)
     )
-
-
-def _angle_joint(text: str) -> str:
-    """Return the option angle_joint unchanged if it is valid."""
-    from ..exposures.angles import joints_by_fluoroscope
-
-    try:
-        joints_by_fluoroscope(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return text
 
 
 def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSelection:

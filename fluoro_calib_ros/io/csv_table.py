@@ -346,18 +346,16 @@ class NamedColumn:
     def __init__(self, column: str, known: Mapping[str, int] | None) -> None:
         self._column = column
         self._known = known
-        self._codes: dict[str, int] | None = None
-        self._is_first = True
+        self._codes: dict[str, int] = {}
+        self._has_names: bool | None = None if known is not None else False
 
     def read(self, block: Block) -> NDArray[np.int64]:
         """Return ids (n,), or codes of names in the order of occurrence. Raises DataError."""
-        if self._is_first:
-            self._is_first = False
-            if self._known is not None and _are_names(block.strings(self._column)):
-                self._codes = {}
-        if self._codes is None:
-            return block.ids(self._column)
         cells = block.strings(self._column)
+        if self._has_names is None:  # an empty cell is not a name
+            self._has_names = not any(is_number(cell or 'nan') for cell in cells)
+        if not self._has_names:
+            return block.ids(self._column)
         if '' in cells:
             block.fail(cells.index(''), f'{self._column} is empty')
         for name in dict.fromkeys(cells):
@@ -375,17 +373,6 @@ class NamedColumn:
         """Convert values returned by `read` to ids, after all blocks have been read."""
         ids = self.ids()
         return np.array(list(ids.values()), dtype=np.int64)[values] if ids else values
-
-
-def _are_names(cells: Sequence[str]) -> bool:
-    """Return whether no cell is a number; an empty cell counts as a number."""
-    for cell in cells:
-        try:
-            float(cell or 'nan')
-        except ValueError:
-            continue
-        return False
-    return True
 
 
 # The file DIR/names.csv: names of targets, exposures and fluoroscopes, `kind,id,name`.

@@ -32,12 +32,10 @@ from ..observations import corrections_of, read_named_observations, write_observ
 from ..phantom import COLUMNS as PHANTOM
 from ..phantom import read_named_phantom, write_phantom
 from .content import (
-    Camera,
     Content,
     FileSettings,
     Format,
     Points,
-    Sample,
     Written,
     camera_at,
     common_focal_length,
@@ -203,26 +201,15 @@ FORMATS = (
 TITLE = 'known orientations'
 
 
-def recognise(sample: Sample) -> bool:
-    """Return whether the file has an entry fluoroscopes and a matrix K."""
-    keys = {line.split(':')[0] for line in sample.lines}
-    return {'fluoroscopes', 'K'} <= keys
-
-
 def read(path: Path, settings: FileSettings) -> Content:
     """Read the cameras. Raises DataError."""
-    return Content(
-        cameras=tuple(
-            _camera(name, orientation, settings)
-            for name, orientation in read_known_orientations(path).items()
-        )
-    )
-
-
-def _camera(name: str, known: KnownOrientation, settings: FileSettings) -> Camera:
-    xp, yp, c = known.interior.tolist()
-    matrix = np.array([[c, 0, xp], [0, c, yp], [0, 0, 1]])
-    return camera_at(name, matrix, settings.image_size, known.rotation, known.position_mm)
+    cameras = []
+    for name, known in read_known_orientations(path).items():
+        xp, yp, c = known.interior.tolist()
+        matrix = np.array([[c, 0, xp], [0, c, yp], [0, 0, 1]])
+        camera = camera_at(name, matrix, settings.image_size, known.rotation, known.position_mm)
+        cameras.append(camera)
+    return Content(cameras=tuple(cameras))
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
@@ -241,7 +228,7 @@ KNOWN_ORIENTATION = Format(
     'known_orientation',
     f'{TITLE} of fluoro_calib_ros',
     parts=('cameras',),
-    recognise=recognise,
+    recognise=lambda sample: {'fluoroscopes', 'K'} <= {n.split(':')[0] for n in sample.lines},
     read=read,
     write=write,
 )

@@ -701,9 +701,7 @@ def _misfit(
     ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> float:
     """Return the weighted squares of a fit of coordinates (k, 3) to CT, over their limit."""
-    return _squares_of_fit(ct, adjusted, sd) / float(
-        chdtri(3 * len(ct) - POSE_SIZE, REJECT_TAIL)
-    )
+    return _squares_of_fit(ct, adjusted, sd) / float(chdtri(3 * len(ct) - POSE_SIZE, REJECT_TAIL))
 
 
 def _scale(

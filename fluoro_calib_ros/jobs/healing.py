@@ -54,7 +54,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
-from ..reconstruction.timing import timing_fault
+from ..reconstruction.timing import timing_of_recording
 
 BLOCKS = 10  # blocks of a recording, alternately used for the diagnosis and for its verdict
 MAX_EXPOSURES = 100  # maximum number used for each of these, evenly spread
@@ -221,7 +221,7 @@ def _exposures_of(
         marker_frames, calibrations, orientation, options, must_explain=False
     )
     paired, _ = pair_recording(frames_with_noise, orientation.fluoroscopes, options)
-    fault = timing_fault(paired, calibrations, orientation)
+    fault = timing_of_recording(paired, calibrations, orientation)
     if fault is not None:  # it would look like a change of the rig
         raise DataError(fault)
     return paired, noise

@@ -34,7 +34,7 @@ from ..reconstruction.reconstruct import (
     pair_recording,
     reconstruct_recording,
 )
-from ..reconstruction.timing import timing_fault
+from ..reconstruction.timing import timing_of_recording
 
 if TYPE_CHECKING:
     import pandas
@@ -197,7 +197,7 @@ def check_rays(
     """
     orientation = intersector.orientation
     exposures, _ = pair_recording(frames, orientation.fluoroscopes, pairing)
-    timing = timing_fault(exposures, calibrations, orientation)
+    timing = timing_of_recording(exposures, calibrations, orientation)
     finding = why_rays_miss(
         reconstruction,
         frames,

@@ -12,9 +12,10 @@ ones are paired with those of the neighbouring exposure: the delay changes by on
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, permutations
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..rows import chosen_rows, joined_rows
 from .epipolar import EpipolarGeometry
-from .reconstruct import corrected_view, match_views
+from .reconstruct import CorrectedView, corrected_view, match_views
 
 MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
 MIN_SIGMAS = 5.0  # minimum delay over its standard deviation: one in a million by chance
@@ -46,22 +47,40 @@ MAX_EXCESS = 0.25
 KEPT = 0.796  # weighted variance of normal residuals over their variance, by these weights
 
 
+class TimedFrame(Protocol):
+    """Frame of a fluoroscope, such as a Frame."""
+
+    @property
+    def number(self) -> int:
+        """Number of the frame."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the frame [ns], 0 if unknown."""
+
+
+AnyFrame = TypeVar('AnyFrame', bound=TimedFrame)
+
+
 def timing_fault(
-    exposures: Sequence[Mapping[str, Frame]],
-    calibrations: Calibrations,
+    exposures: Sequence[Mapping[str, AnyFrame]],
+    corrected: Callable[[AnyFrame], CorrectedView],
     orientation: RigOrientation,
 ) -> Finding | None:
     """Return a warning if the frames of exposures were not taken at the same time, or None.
 
-    A fluoroscope is delayed relative to the first, or has lost a frame. exposures: frames of a
-    recording by fluoroscope, in temporal order. The warning is on the most significant delay.
+    A fluoroscope is delayed relative to the first, or has lost a frame. The warning is on the most
+    significant delay.
+
+    exposures: frames by fluoroscope, in temporal order. corrected: returns the corrected view of a
+    frame.
     """
     first, *others = orientation.fluoroscopes
     motions = {}
     delays: dict[str, Delay] = {}
     for name in others:
         geometry = EpipolarGeometry(orientation, first, name)
-        motions[name] = _motion(exposures, calibrations, geometry)
+        motions[name] = _motion(exposures, corrected, geometry)
         delay = fitted_delay(motions[name])
         if delay is not None and delay.is_cause:
             delays[name] = delay
@@ -70,6 +89,19 @@ def timing_fault(
         return delay_finding((first, name), delays[name], _interval_s(exposures, first))
     lost = (find_lost_frame((first, name), motion) for name, motion in motions.items())
     return next((finding for finding in lost if finding is not None), None)
+
+
+def timing_of_recording(
+    exposures: Sequence[Mapping[str, Frame]],
+    calibrations: Calibrations,
+    orientation: RigOrientation,
+) -> Finding | None:
+    """Return the fault of the timing of paired frames, or None; see `timing_fault`."""
+    return timing_fault(
+        exposures,
+        lambda frame: corrected_view(frame, calibrations[frame.fluoroscope]),
+        orientation,
+    )
 
 
 @dataclass(frozen=True)
@@ -217,15 +249,15 @@ def delay_finding(names: tuple[str, str], delay: Delay, interval_s: float) -> Fi
     )
 
 
-def _interval_s(exposures: Sequence[Mapping[str, Frame]], name: str) -> float:
+def _interval_s(exposures: Sequence[Mapping[str, TimedFrame]], name: str) -> float:
     """Return the median interval of the frames of a fluoroscope [s], 0 without stamps."""
     stamps = [exposure[name].stamp_ns for exposure in exposures if name in exposure]
     return float(np.median(np.diff(stamps))) / NS_PER_S if len(stamps) > 1 else 0.0
 
 
 def _motion(
-    exposures: Sequence[Mapping[str, Frame]],
-    calibrations: Calibrations,
+    exposures: Sequence[Mapping[str, AnyFrame]],
+    corrected: Callable[[AnyFrame], CorrectedView],
     geometry: EpipolarGeometry,
 ) -> Motion:
     """Return the residuals of exposures, evenly spaced, whose neighbours have frames of b."""
@@ -238,9 +270,8 @@ def _motion(
     steps = np.linspace(0, len(successive) - 1, min(MAX_EXPOSURES, len(successive)))
     for row in steps.astype(int):
         before, exposure, after = successive[row]
-        views = [corrected_view(exposure[a], calibrations[a])]
-        views += [corrected_view(one[b], calibrations[b]) for one in (before, exposure, after)]
-        matched = match_views(views)
+        frames = [exposure[a], before[b], exposure[b], after[b]]
+        matched = match_views([corrected(frame) for frame in frames])
         in_a, *in_b = matched.uv
         sigma_a, _, sigma_b, _ = matched.sigma
         found = [geometry.residuals(in_a, uv, sigma_a, sigma_b) for uv in in_b]
@@ -261,8 +292,8 @@ def _motion(
 
 
 def _successive(
-    exposures: Sequence[Mapping[str, Frame]], name: str
-) -> Iterator[Sequence[Mapping[str, Frame]]]:
+    exposures: Sequence[Mapping[str, AnyFrame]], name: str
+) -> Iterator[Sequence[Mapping[str, AnyFrame]]]:
     """Yield three exposures at a time whose frames of a fluoroscope follow each other."""
     follows = [two[name].number == one[name].number + 1 for one, two in pairwise(exposures)]
     for row, both in enumerate(pairwise(follows)):

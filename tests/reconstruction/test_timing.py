@@ -15,7 +15,7 @@ from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.jobs.reconstruction import reconstruct
 from fluoro_calib_ros.reconstruction.reconstruct import pair_recording
-from fluoro_calib_ros.reconstruction.timing import timing_fault
+from fluoro_calib_ros.reconstruction.timing import timing_of_recording
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
@@ -53,7 +53,7 @@ def recorded(steps, names='ab', seed=4, seconds=2.0, rate_hz=RATE_HZ):
 def found(frames, names='ab', orientation=None):
     calibrations, known_orientation = known(names)
     exposures, _ = pair_recording(frames, list(names), RecordedPairing())
-    return timing_fault(exposures, calibrations, orientation or known_orientation)
+    return timing_of_recording(exposures, calibrations, orientation or known_orientation)
 
 
 @pytest.mark.parametrize('names', ['ab', 'abc'])

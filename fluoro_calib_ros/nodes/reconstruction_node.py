@@ -23,8 +23,8 @@ from ..exposures.pairing import PairingOptions, exposure_pairer
 from ..exposures.stamps import nanoseconds_from_stamp
 from ..limits import StreamLimits
 from ..options import option
-from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
+from ..reconstruction.timing import RecentExposures
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
@@ -136,6 +136,10 @@ class _View:
     stamp_ns: int
     frame: CorrectedFrame
 
+    def corrected(self) -> CorrectedView:
+        """Return the corrected image points."""
+        return CorrectedView.of_columns(self.frame.target_id, self.frame.columns)
+
 
 class ReconstructionNode(StreamNode):
     """Publishes points in space for every exposure with at least two views."""
@@ -166,7 +170,7 @@ class ReconstructionNode(StreamNode):
         )
         self._pairer = exposure_pairer(self._names, self._settings.pairing)
         self._points = PointsCounter()
-        self._misses = RecentMisses()
+        self._recent = RecentExposures(_View.corrected)
         self._follower: BodyFollower | None = None
         self._exposures = 0
         self._reconstructed = 0
@@ -258,7 +262,7 @@ class ReconstructionNode(StreamNode):
     def _on_orientation(self, message: RigOrientation) -> None:
         """Use an orientation, and publish its transforms."""
         if self._rigs.add(message):
-            self._misses = RecentMisses()
+            self._recent = RecentExposures(_View.corrected)
             self._publish_transforms(message)
 
     def _on_calibrated(self, message: RigOrientation) -> None:
@@ -306,11 +310,7 @@ class ReconstructionNode(StreamNode):
         if rig is None:
             self._without_orientation += 1
             return False
-        frames = [exposure[name].frame if name in exposure else None for name in self._names]
-        views = [
-            None if frame is None else CorrectedView.of_columns(frame.target_id, frame.columns)
-            for frame in frames
-        ]
+        views = [exposure[name].corrected() if name in exposure else None for name in self._names]
         first_view = next(exposure[name] for name in self._names if name in exposure)
         self._drift.newest = rig.watch, rig.orientation, first_view.stamp_ns
         intersector, image_sd = rig.widened()
@@ -328,7 +328,7 @@ class ReconstructionNode(StreamNode):
         self._retractions.note({n: view.stamp_ns for n, view in exposure.items()}, content)
         self._reconstructed += 1
         self._points.add(intersected.points)
-        self._misses.add(intersected.points)
+        self._recent.add(exposure, intersected.points)
         if self._follower is not None:
             widened = rig._replace(intersector=intersector)
             number = content.frame_number
@@ -342,6 +342,10 @@ class ReconstructionNode(StreamNode):
 
     def diagnose(self) -> list[Status]:
         """Return the status of the reconstruction, of bodies and joints, and of the watch."""
+        rig = self._rigs.newest
+        misses, timing = (None, None)
+        if rig is not None:
+            misses, timing = self._recent.faults(rig.orientation, rig.scatter.factor)
         state = ReconstructionState(
             node=self,
             topics=tuple(f'{name}/{VIEWS}' for name in self._names),
@@ -357,7 +361,8 @@ class ReconstructionNode(StreamNode):
             streams=self._streams,
             rigs=self._rigs,
             pairer=self._pairer,
-            misses=self._misses,
+            misses=misses,
+            timing=timing,
         )
         status = Status('reconstruction', *health_of(state, CONDITIONS), self._values())
         bodies = [] if self._follower is None else statuses_of(self._follower, self.recent)

@@ -22,7 +22,7 @@ from visualization_msgs.msg import MarkerArray
 
 from ..bodies.body import STATUS_NAMES, Body, PoseStatus
 from ..exposures.pairing import Pairer
-from ..reconstruction.epipolar import RecentMisses
+from ..findings import Finding
 from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, IntersectedPoints
 from .messages.bodies import (
     BODY_FORMS,
@@ -173,7 +173,8 @@ class ReconstructionState(InputState):
     streams: Mapping[str, Stream]  #: by fluoroscope
     rigs: RigInput
     pairer: Pairer
-    misses: RecentMisses
+    misses: Finding | None  #: why most rays of recent exposures miss each other
+    timing: Finding | None  #: fault of the timing of recent exposures
 
 
 def stalled_streams(state: ReconstructionState) -> Health | None:
@@ -196,7 +197,7 @@ def _missing_publishers(state: ReconstructionState) -> str:
 
 def _missed_rays(state: ReconstructionState) -> str:
     """Return a message if the rays of the views do not intersect."""
-    finding = state.misses.finding()
+    finding = state.misses
     disagreement = state.pairer.stamps.disagreement()
     return '; '.join(filter(None, (finding.sentence, disagreement))) if finding else ''
 
@@ -218,6 +219,7 @@ def _distant_stamps(state: ReconstructionState) -> str:
 STREAM_CONDITIONS = (
     warns(_missing_publishers),
     fails(_missed_rays),
+    warns(lambda state: state.timing and state.timing.sentence),
     warns(_silent_fluoroscopes),
     counted(
         'without_orientation',

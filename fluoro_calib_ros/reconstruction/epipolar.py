@@ -240,8 +240,11 @@ class RecentMisses:
         """Add the points of an exposure."""
         self._recent.append(_counts(points.status))
 
-    def finding(self) -> Finding | None:
-        """Return what is wrong if the points of the recent exposures are implausible, or None."""
+    def finding(self, timing: Finding | None = None) -> Finding | None:
+        """Return what is wrong if the points of the recent exposures are implausible, or None.
+
+        timing: fault of their timing, which is the cause if there is one.
+        """
         rejected, total, single = (
             sum(column) for column in zip(*list(self._recent) or [(0, 0, 0)])
         )
@@ -249,7 +252,7 @@ class RecentMisses:
             return UNMATCHED
         if total < MIN_POINTS or rejected <= MAX_REJECTED * total:
             return None
-        return missing_rays(rejected / total, UNKNOWN)
+        return missing_rays(rejected / total, timing or UNKNOWN)
 
 
 def missing_rays(share: float, reason: Finding) -> Finding:

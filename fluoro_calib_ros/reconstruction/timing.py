@@ -12,10 +12,11 @@ ones are paired with those of the neighbouring exposure: the delay changes by on
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, permutations
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,8 @@ from ..exposures.stamps import NS_PER_S
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..rows import chosen_rows, joined_rows
-from .epipolar import EpipolarGeometry
+from .epipolar import RECENT, EpipolarGeometry, RecentMisses
+from .intersection import IntersectedPoints
 from .reconstruct import CorrectedView, corrected_view, match_views
 
 MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
@@ -89,6 +91,35 @@ def timing_fault(
         return delay_finding((first, name), delays[name], _interval_s(exposures, first))
     lost = (find_lost_frame((first, name), motion) for name, motion in motions.items())
     return next((finding for finding in lost if finding is not None), None)
+
+
+class RecentExposures(Generic[AnyFrame]):
+    """Recent exposures of a stream, whose rays and timing are judged.
+
+    corrected: returns the corrected view of a frame.
+    """
+
+    def __init__(self, corrected: Callable[[AnyFrame], CorrectedView]) -> None:
+        self._corrected = corrected
+        self._recent: deque[Mapping[str, AnyFrame]] = deque(maxlen=RECENT)
+        self._misses = RecentMisses()
+
+    def add(self, exposure: Mapping[str, AnyFrame], points: IntersectedPoints) -> None:
+        """Add an exposure, frames by fluoroscope, with its points."""
+        self._recent.append(exposure)
+        self._misses.add(points)
+
+    def faults(
+        self, orientation: RigOrientation, widening: float
+    ) -> tuple[Finding | None, Finding | None]:
+        """Return why most rays miss each other, and the fault of the timing, each or None.
+
+        The timing is judged if rays miss each other by more than expected (widening above 1).
+        """
+        timing = None
+        if widening > 1:
+            timing = timing_fault(list(self._recent), self._corrected, orientation)
+        return self._misses.finding(timing), timing
 
 
 def timing_of_recording(

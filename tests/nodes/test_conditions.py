@@ -94,7 +94,8 @@ def reconstruction_state(stalled, publishers=MappingProxyType({}), **changes):
             tolerance=StampTolerance(1),
             silent=frozenset(),
         ),
-        'misses': SimpleNamespace(finding=lambda: None),
+        'misses': None,
+        'timing': None,
         'recent': Counter(),
     }
     return reconstruction.ReconstructionState(**{**values, **changes})
@@ -106,10 +107,15 @@ def test_stopped_streams_stand_before_what_else_is_wrong():
     stopped = reconstruction_state([('a', 'no frame for 2 s'), ('b', '')])
     assert health_of(stopped, reconstruction.CONDITIONS) == (WARN, 'a: no frame for 2 s')
     missing = Finding(Kind.RAYS_DO_NOT_MEET, 'the rays miss each other')
-    wrong = SimpleNamespace(finding=lambda: missing)
-    both = reconstruction_state([('a', 'no frame for 2 s'), ('b', '')], misses=wrong)
+    both = reconstruction_state([('a', 'no frame for 2 s'), ('b', '')], misses=missing)
     found = health_of(both, reconstruction.CONDITIONS)
     assert found == (ERROR, 'a: no frame for 2 s; the rays miss each other')
+
+
+def test_fluoroscopes_that_are_not_synchronous_are_a_warning():
+    late = Finding(Kind.FRAMES_DELAYED, 'b is late')
+    state = reconstruction_state([('a', '')], timing=late)
+    assert health_of(state, reconstruction.CONDITIONS) == (WARN, 'b is late')
 
 
 def test_stamps_that_fit_two_exposures_are_a_warning():

@@ -14,8 +14,13 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.jobs.reconstruction import reconstruct
-from fluoro_calib_ros.reconstruction.reconstruct import pair_recording
-from fluoro_calib_ros.reconstruction.timing import timing_of_recording
+from fluoro_calib_ros.reconstruction.intersection import Intersector
+from fluoro_calib_ros.reconstruction.reconstruct import (
+    corrected_view,
+    pair_recording,
+    reconstruct_recording,
+)
+from fluoro_calib_ros.reconstruction.timing import RecentExposures, timing_of_recording
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
@@ -145,6 +150,20 @@ def test_reconstruction_of_a_recording_tells_the_delay():
     assert outcome.timing.kind is Kind.FRAMES_DELAYED
     assert outcome.drift.finding.kind is Kind.NOT_WATCHED
     assert reconstruct(recorded(0), calibrations, orientation).timing is None
+
+
+def test_a_stream_is_judged_if_its_rays_miss():
+    calibrations, orientation = known()
+    recent = RecentExposures(lambda frame: corrected_view(frame, calibrations[frame.fluoroscope]))
+    frames = recorded(2, seconds=12.0, rate_hz=5.0)
+    points, _ = reconstruct_recording(frames, calibrations, Intersector(orientation))
+    exposures, _ = pair_recording(frames, 'ab', RecordedPairing())
+    for exposure, frame in zip(exposures, points, strict=True):
+        recent.add(exposure, frame.points)
+    misses, timing = recent.faults(orientation, widening=2.0)
+    assert misses.kind is timing.kind is Kind.FRAMES_DELAYED and misses.numbers['share'] > 0.5
+    misses, timing = recent.faults(orientation, widening=1.0)
+    assert misses.kind is Kind.RAYS_DO_NOT_MEET and timing is None
 
 
 def test_a_delay_is_the_cause_if_most_rays_miss():

@@ -141,11 +141,8 @@ class AngleTrack:
     def at(self, stamp_ns: int) -> float | None:
         """Return the angle at a time [rad], None if unknown."""
         self._asked = max(stamp_ns, self._asked or 0)
-        index = bisect_right(self._stamps, stamp_ns) - 1
-        if index < 0 or stamp_ns - self._stamps[index] > self._max_age_ns:
-            return None
-        angle = self._angles[index]
-        return None if math.isnan(angle) else angle
+        is_known = not self.doubt(stamp_ns)
+        return self._angles[bisect_right(self._stamps, stamp_ns) - 1] if is_known else None
 
     def doubt(self, stamp_ns: int) -> str:
         """Return why the angle at a time is unknown, '' if it is known."""

@@ -149,13 +149,17 @@ def _frame_error(frame: Frame, phantom: Phantom | None, image_size: tuple[int, i
         return f'{len(ids)} target ids, but image points of shape {uv.shape}'
     if frame.sigma is not None and len(frame.sigma) != len(ids):
         return length_error(ids, sigma=frame.sigma)
+    finite = np.isfinite(uv).all(axis=1)
+    on_image = points_on_image(uv, frame.image_size)
+    on_phantom = [] if phantom is None else phantom.index(ids) >= 0
+    outside = f'target {{}} is outside the image of {width} x {height} px'
     return (
         angle_error(frame.angle)
-        or _finite_error(ids, uv)
+        or _first_error(ids, finite, 'the image point of target {} is not a number')
         or ('' if frame.sigma is None else sigma_error(ids, frame.sigma))
-        or _image_error(ids, uv, frame.image_size)
+        or _first_error(ids, on_image, outside)
         or repeated_target_error(ids)
-        or ('' if phantom is None else _phantom_error(ids, phantom))
+        or _first_error(ids, np.asarray(on_phantom), 'target {} is not on the phantom')
     )
 
 
@@ -206,10 +210,8 @@ def image_size_error(image_size: tuple[int, int], expected: tuple[int, int]) -> 
 
 def sigma_error(target_id: ArrayLike, sigma: ArrayLike) -> str:
     """Return the error of the first target whose sigma is not a positive number."""
-    valid = is_positive(sigma)
-    if valid.all():
-        return ''
-    return f'sigma of target {np.asarray(target_id)[valid.argmin()]} is not a positive number'
+    ids = np.asarray(target_id)
+    return _first_error(ids, is_positive(sigma), 'sigma of target {} is not a positive number')
 
 
 def repeated_target_error(target_id: ArrayLike) -> str:
@@ -242,24 +244,9 @@ def stack_image_points(
     return ids.astype(np.int64), uv, deviations.astype(float) if len(deviations) else None
 
 
-def _finite_error(ids: NDArray[np.int64], uv: NDArray[np.float64]) -> str:
-    finite = np.isfinite(uv).all(axis=1)
-    return '' if finite.all() else f'the image point of target {ids[~finite][0]} is not a number'
-
-
-def _image_error(
-    ids: NDArray[np.int64], uv: NDArray[np.float64], image_size: tuple[int, int]
-) -> str:
-    inside = points_on_image(uv, image_size)
-    if inside.all():
-        return ''
-    width, height = image_size
-    return f'target {ids[~inside][0]} is outside the image of {width} x {height} px'
-
-
-def _phantom_error(ids: NDArray[np.int64], phantom: Phantom) -> str:
-    known = phantom.index(ids) >= 0
-    return '' if known.all() else f'target {ids[~known][0]} is not on the phantom'
+def _first_error(ids: NDArray[np.int64], valid: NDArray[np.bool_], error: str) -> str:
+    """Return the error of the first target that is not valid (n,), '' if all are."""
+    return '' if valid.all() else error.format(ids[~valid][0])
 
 
 def cells_of(uv: ArrayLike, image_size: ArrayLike, count: int) -> NDArray[np.int64]:

@@ -111,11 +111,7 @@ class StampAgreement:
         sentence says that frames are not numbered.
         """
         first, *others = self._fluoroscopes
-        for other in others:
-            sentence = self._compare(first, other)
-            if sentence:
-                return sentence
-        return ''
+        return next(filter(None, (self._compare(first, other) for other in others)), '')
 
     def _compare(self, one: str, other: str) -> str:
         rows = [

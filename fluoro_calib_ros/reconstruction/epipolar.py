@@ -107,13 +107,7 @@ class EpipolarGeometry:
         sigma_a and sigma_b (n,), or a number for all: standard deviations of their coordinates
         [px].
         """
-        x_a = _directions(uv_a, self._interior[0])
-        x_b = _directions(uv_b, self._interior[1])
-        line_b = x_a @ self.essential.T
-        line_a = x_b @ self.essential
-        c_a, c_b = self._interior[:, 2]
-        slope_a = line_a[:, :2] / c_a
-        slope_b = line_b[:, :2] / c_b
+        x_b, slope_a, slope_b, line_b, terms = self._slopes(uv_a, uv_b)
         square_a = np.sum(slope_a * slope_a, axis=1)
         square_b = np.sum(slope_b * slope_b, axis=1)
         norm2 = square_a + square_b
@@ -121,8 +115,6 @@ class EpipolarGeometry:
         length_a = np.sqrt(square_a)
         length_b = np.sqrt(square_b)
         by_image = square_a * np.square(sigma_a) + square_b * np.square(sigma_b)
-        # The constraint is linear in E; its nine terms are the products of the coordinates.
-        terms = (x_b[:, :, None] * x_a[:, None, :]).reshape(-1, 9)
         by_rig = np.sum((terms @ self._covariance) * terms, axis=1)
         return EpipolarResiduals(
             residual=np.sum(x_b * line_b, axis=1) / norm,
@@ -136,18 +128,23 @@ class EpipolarGeometry:
 
     def by_essential(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
         """Return derivatives (n, 9) of the residuals by the elements of E, by rows."""
-        x_a = _directions(uv_a, self._interior[0])
-        x_b = _directions(uv_b, self._interior[1])
-        c_a, c_b = self._interior[:, 2]
-        slope_a = (x_b @ self.essential)[:, :2] / c_a
-        slope_b = (x_a @ self.essential.T)[:, :2] / c_b
+        _, slope_a, slope_b, _, terms = self._slopes(uv_a, uv_b)
         norm = np.sqrt(np.sum(slope_a * slope_a + slope_b * slope_b, axis=1))
-        terms = (x_b[:, :, None] * x_a[:, None, :]).reshape(-1, 9)
         return np.asarray(terms / norm[:, None])
 
     def by_orientation(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
         """Return derivatives (n, 18) of the residuals by T, w, xp, yp, c of a and of b."""
         return np.asarray(self.by_essential(uv_a, uv_b) @ self._derivative)
+
+    def _slopes(self, uv_a: ArrayLike, uv_b: ArrayLike) -> tuple[NDArray[np.float64], ...]:
+        """Return directions (n, 3) in b, slopes (n, 2) in a and b, lines in b, terms (n, 9)."""
+        x_a = _directions(uv_a, self._interior[0])
+        x_b = _directions(uv_b, self._interior[1])
+        line_b = x_a @ self.essential.T
+        c_a, c_b = self._interior[:, 2]
+        # The constraint is linear in E; its nine terms are the products of the coordinates.
+        terms = (x_b[:, :, None] * x_a[:, None, :]).reshape(-1, 9)
+        return x_b, (x_b @ self.essential)[:, :2] / c_a, line_b[:, :2] / c_b, line_b, terms
 
 
 def _directions(uv: ArrayLike, interior: NDArray[np.float64]) -> NDArray[np.float64]:

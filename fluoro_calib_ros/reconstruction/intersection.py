@@ -296,7 +296,13 @@ class Intersector:
                 )
                 rays = rays - (dropped_view >= 0)
                 is_wrong = is_wrong & (dropped_view < 0)
-            solution = _without_points(solution, is_wrong)
+            unknown = np.where(is_wrong, np.nan, 1.0)[:, None]
+            solution = replace(
+                solution,
+                xyz=solution.xyz * unknown,
+                covariance=solution.covariance * unknown[..., None],
+                noise=solution.noise * unknown[..., None],
+            )
         status = np.where(is_wrong, np.where(solution.failed, FAILED, REJECTED), OK).astype(
             np.uint8
         )
@@ -345,34 +351,18 @@ class Intersector:
         return _Solution(**values), dropped
 
 
-def _without_points(solution: _Solution, wrong: NDArray[np.bool_]) -> _Solution:
-    """Set coordinates and covariances of wrong points (n,) to NaN."""
-    xyz = solution.xyz.copy()
-    covariance = solution.covariance.copy()
-    noise = solution.noise.copy()
-    for value in (xyz, covariance, noise):
-        value[wrong] = np.nan
-    return replace(solution, xyz=xyz, covariance=covariance, noise=noise)
-
-
 def _expanded(
     intersected: IntersectedPoints, enough: NDArray[np.bool_], rays: NDArray[np.int64]
 ) -> IntersectedPoints:
     """Return the points of all n targets, given those that enough (n,) fluoroscopes see."""
-    n = len(enough)
-    out = IntersectedPoints(
-        xyz_mm=np.full((n, 3), np.nan),
-        covariance=np.full((n, 3, 3), np.nan),
-        covariance_noise=np.full((n, 3, 3), np.nan),
-        residual=np.full(n, np.nan),
-        rays=rays.copy(),
-        standardised=np.full(n, np.nan),
-        status=np.full(n, SINGLE_VIEW, dtype=np.uint8),
-        dropped_view=np.full(n, -1),
-    )
+    unknown = {'rays': rays, 'status': SINGLE_VIEW, 'dropped_view': -1}
+    values = {}
     for field in fields(IntersectedPoints):
-        getattr(out, field.name)[enough] = getattr(intersected, field.name)
-    return out
+        value = getattr(intersected, field.name)
+        values[field.name] = np.empty((len(enough), *value.shape[1:]), dtype=value.dtype)
+        values[field.name][:] = unknown.get(field.name, np.nan)
+        values[field.name][enough] = value
+    return IntersectedPoints(**values)
 
 
 def _inverse(normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

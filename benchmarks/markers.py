@@ -60,7 +60,7 @@ from fluoro_calib_ros.simulation.marker_images import (
     MarkerSequence,
     MovingMarkers,
 )
-from fluoro_calib_ros.simulation.radiographs import RadiographSettings
+from fluoro_calib_ros.simulation.radiographs import RadiographSettings, detected
 from fluoro_calib_ros.simulation.rig import (
     BETWEEN_DEG,
     BETWEEN_THREE_DEG,
@@ -199,19 +199,27 @@ class Record:
         )
 
 
+def expected_light(
+    radiography: MarkerRadiography, frame: int, rows: np.ndarray, *shift_mm: tuple[float, ...]
+) -> np.ndarray:
+    """Return the expected light (h, w) of markers in rows (k,), 1 in the open beam."""
+    light, _, _ = radiography._light(frame, rows, *shift_mm)
+    return detected(light, radiography.settings)
+
+
 def bounds(radiography: MarkerRadiography, frame: int, true: np.ndarray) -> np.ndarray:
     """Return Cramer-Rao bounds (n,) [px] of markers at true (n, 2), NaN unless isolated."""
     every = np.arange(len(true))
     fluoroscope = radiography.fluoroscope
-    light = radiography.expected_light(frame, every)
-    without = radiography.expected_light(frame, every[:0])
+    light = expected_light(radiography, frame, every)
+    without = expected_light(radiography, frame, every[:0])
     slopes = []
     still = (np.eye(3), np.zeros(3))
     points = radiography.markers.points_mm(frame)
     for axis in fluoroscope.rotation[:2]:
         step = STEP_MM * axis
-        ahead = radiography.expected_light(frame, every, tuple(step))
-        behind = radiography.expected_light(frame, every, tuple(-step))
+        ahead = expected_light(radiography, frame, every, tuple(step))
+        behind = expected_light(radiography, frame, every, tuple(-step))
         moved = radiography.centres(points + step, still) - radiography.centres(
             points - step, still
         )

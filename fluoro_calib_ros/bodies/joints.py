@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from ..brief import brief_repr
 from ..errors import DataError
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
+from ..rows import chosen_rows
 from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame, Convention, convention
 from .body import BodyPoses, PoseStatus
 
@@ -169,7 +170,9 @@ def joint_motion(
         exposures = np.flatnonzero(is_selected)
         for start in range(0, len(exposures), BLOCK):
             rows = exposures[start : start + BLOCK]
-            covariance[rows] = _second_moments(of, relative.of(rows), angles[rows], nodes)
+            covariance[rows] = _second_moments(
+                of, chosen_rows(relative, rows), angles[rows], nodes
+            )
     signs = np.array([*of.angle_signs, *of.translation_signs], dtype=float)
     determined = np.isfinite(angles).all(axis=1) & ~locked
     return JointMotion(
@@ -258,9 +261,6 @@ class _Relative:
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
     covariance: NDArray[np.float64]
-
-    def of(self, rows: NDArray[np.int64]) -> _Relative:
-        return _Relative(self.rotation[rows], self.translation[rows], self.covariance[rows])
 
 
 def _relative(

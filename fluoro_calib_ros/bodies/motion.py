@@ -402,20 +402,11 @@ class _Scores:
 def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
     """Smooth backwards over the steps of a filter."""
     count = len(steps[0].z)
-    total = len(steps)
-    motion = Motion(
-        np.empty((total, count, 3, 3)),
-        np.empty((total, count, 3)),
-        velocity=np.empty((total, count, 6)),
-        acceleration=np.empty((total, count, 6)),
-        covariance=np.empty((total, count, STATE, STATE)),
-        log_q=np.stack([step.log_q for step in steps]),
-    )
-    scores = _Scores(np.zeros((total, count, 2)), np.zeros((total, count, 2)))
+    rows = []
+    scores = []
     r = np.zeros((count, STATE))
     n = np.zeros((count, STATE, STATE))
-    for k in range(total - 1, -1, -1):
-        step = steps[k]
+    for step in reversed(steps):
         # r and n already contain L'F'r and L'F'N F L of the next step.
         gain = step.covariance[:, :, POSE]
         factor = _EYE_STATE - gain @ step.m @ _POSE_ROWS
@@ -427,21 +418,18 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         rotation, mean = _moved(step, (step.covariance @ r[:, :, None])[:, :, 0])
         turn = turn_of_twists(step.reference, rotation)
         covariance = _turned_covariance(_smoothed_covariance(step.covariance, n), turn)
-        motion.rotation[k] = rotation
-        motion.centre_mm[k] = mean[:, :3]
-        motion.velocity[k] = mean[:, 6:12]
-        motion.acceleration[k] = mean[:, 12:]
-        motion.covariance[k] = covariance
-        for kind, noise in enumerate(np.swapaxes(_noise(step.dt_s, step.log_q), 0, 1)):
-            product = noise @ n
-            information = np.trace(product, axis1=1, axis2=2)
-            squared = (r[:, None] @ noise @ r[:, :, None])[:, 0, 0]
-            scores.gradient[k, :, kind] = np.where(step.started, 0, 0.5 * (squared - information))
-            scores.information[k, :, kind] = np.where(step.started, 0, 0.5 * information)
+        rows.append((rotation, mean[:, :3], mean[:, 6:12], mean[:, 12:], covariance))
+        noise = _noise(step.dt_s, step.log_q)
+        information = np.trace(noise @ n[:, None], axis1=2, axis2=3)
+        squared = (r[:, None, None] @ noise @ r[:, None, :, None])[..., 0, 0]
+        score = np.stack([0.5 * (squared - information), 0.5 * information])
+        scores.append(np.where(step.started[:, None], 0, score))
         forward = np.swapaxes(step.into, 1, 2)
         r = (forward @ r[:, :, None])[:, :, 0]
         n = forward @ n @ step.into
-    return motion, scores
+    log_q = np.stack([step.log_q for step in steps])
+    motion = Motion(*(np.stack(values) for values in zip(*rows[::-1])), log_q=log_q)
+    return motion, _Scores(*np.stack(scores[::-1], axis=1))
 
 
 def _moved(

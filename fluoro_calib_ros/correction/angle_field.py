@@ -130,11 +130,9 @@ class AngleField:
             return self._change_at(uv, float(angles))
         duv = np.zeros_like(uv)
         variance = np.zeros(len(uv))
-        for value in np.unique(angles[~np.isnan(angles)]):
-            rows = angles == value
+        for value in np.unique(angles):
+            rows = np.isnan(angles) if np.isnan(value) else angles == value
             duv[rows], variance[rows] = self._change_at(uv[rows], float(value))
-        rows = np.isnan(angles)
-        duv[rows], variance[rows] = self._change_at(uv[rows], np.nan)
         return duv, variance
 
     def duv(self, uv: NDArray[np.float64], angle: float) -> NDArray[np.float64]:

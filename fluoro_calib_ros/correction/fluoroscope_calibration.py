@@ -393,20 +393,13 @@ class FluoroscopeCalibration:
     ) -> CorrectedPoints:
         """Correct points with the model itself."""
         valid = points_on_image(uv, self.image_size)
-        out = CorrectedPoints(
-            np.full(uv.shape, np.nan),
-            np.full(len(uv), np.nan),
-            np.full(len(uv), CorrectionStatus.INVALID, dtype=np.uint8),
+        correction = self.correction(np.where(valid[:, None], uv, 0.0), angle)
+        status = np.where(correction.outside, CorrectionStatus.OUTSIDE, CorrectionStatus.OK)
+        return CorrectedPoints(
+            np.where(valid[:, None], uv - correction.duv, np.nan),
+            np.where(valid, np.sqrt(np.square(sigma) + correction.sd**2), np.nan),
+            np.where(valid, status, CorrectionStatus.INVALID).astype(np.uint8),
         )
-        if angle is not None and np.ndim(angle):
-            angle = np.asarray(angle)[valid]
-        correction = self.correction(uv[valid], angle)
-        out.uv[valid] = uv[valid] - correction.duv
-        out.sigma[valid] = np.sqrt(np.broadcast_to(sigma, len(uv))[valid] ** 2 + correction.sd**2)
-        out.status[valid] = np.where(
-            correction.outside, CorrectionStatus.OUTSIDE, CorrectionStatus.OK
-        )
-        return out
 
 
 def with_drift(

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
-from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
@@ -246,7 +245,8 @@ class Trend:
     """
 
     def __init__(self, degree: int, uv: NDArray[np.float64]) -> None:
-        self._powers = polynomial_powers(degree)
+        self._degree = degree
+        self._powers = np.array(polynomial_powers(degree), dtype=int).reshape(-1, 2)
         self._centre = uv.mean(axis=0) if len(uv) else np.zeros(2)
         self._scale = max(float(np.max(np.abs(uv - self._centre), initial=0.0)), 1.0)
 
@@ -256,11 +256,9 @@ class Trend:
     def basis(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Return values (n, p) of the polynomials at pixels uv (n, 2)."""
         x, y = ((np.asarray(uv) - self._centre) / self._scale).T
-        if not self._powers:
-            return np.empty((len(x), 0))
-        degree = max(i for i, _ in self._powers)
-        i, j = np.transpose(self._powers)
-        return polyvander2d(x, y, [degree, degree])[:, i * (degree + 1) + j]
+        x_basis, y_basis = (np.vander(a, self._degree + 1, increasing=True) for a in (x, y))
+        i, j = self._powers.T
+        return np.asarray(x_basis[:, i] * y_basis[:, j])
 
 
 def least_squares_map(basis: np.ndarray) -> NDArray[np.float64]:

@@ -70,11 +70,11 @@ def residuals_of(
     poses: exterior orientation by exposure; frames of other exposures were not used. points_mm:
     adjusted object points (3,) by target.
     """
-    exposure = []
-    target_id = []
-    uv = []
-    angle = []
-    computed = []
+    exposure = [np.zeros(0, dtype=int)]
+    target_id = [np.zeros(0, dtype=int)]
+    uv = [np.zeros((0, 2))]
+    angle = [np.zeros(0)]
+    computed = [np.zeros((0, 2))]
     for frame in frames:
         if frame.number not in poses:
             continue
@@ -94,12 +94,6 @@ def residuals_of(
                 points,
                 calibration.interior,
             )
-        )
-    if not exposure:
-        no_uv = np.zeros((0, 2))
-        no_ids = np.zeros(0, dtype=int)
-        return Residuals(
-            no_ids, no_ids, uv=no_uv, before=no_uv, after=no_uv, inlier=no_ids.astype(bool)
         )
     numbers, ids, observed, expected = map(np.concatenate, (exposure, target_id, uv, computed))
     angles = np.concatenate(angle)

@@ -183,26 +183,16 @@ class MarkerRadiography(Radiography):
         true_uv = self._true(frame)
         return MarkerImage(image, true_uv, self.in_field(true_uv, 6.0) & ~hidden, uv.mean(axis=0))
 
-    def expected_light(
-        self,
-        frame: int,
-        rows: NDArray[np.int64],
-        shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> NDArray[np.float32]:
-        """Return the expected light (h, w) of markers in rows (k,), 1 in the open beam.
-
-        The markers are shifted by shift_mm in the rig frame.
-        """
-        light, _, _ = self._light(frame, rows, shift_mm)
-        return detected(light, self.settings)
-
     def _light(
         self,
         frame: int,
         rows: NDArray[np.int64],
         shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return light (h, w) before the detector, centres (moments, n, 2), hidden mask (n,)."""
+        """Return light (h, w) before the detector, centres (moments, n, 2), hidden mask (n,).
+
+        Only markers in rows (k,) are traced; all are shifted by shift_mm in the rig frame.
+        """
         scene = self.markers.scene
         moments = frame + scene.shutter * ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5)
         points = np.array([self.markers.points_mm(moment) for moment in moments])

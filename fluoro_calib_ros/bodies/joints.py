@@ -165,8 +165,10 @@ def joint_motion(
     jacobian = _jacobian(of, axes, relative.translation)
     covariance = jacobian @ relative.covariance @ np.swapaxes(jacobian, 1, 2)
     locked = _near_lock(of, angles, covariance)
+    variance = np.diagonal(covariance, axis1=1, axis2=2)[:, :3].max(axis=1)
+    is_nonlinear = variance > LINEAR_SD_RAD**2  # False for NaN
     # Number of Gauss-Hermite nodes per axis: 3 for quadratic errors, 9 near gimbal lock.
-    for nodes, is_selected in ((3, _is_nonlinear(covariance) & ~locked), (9, locked)):
+    for nodes, is_selected in ((3, is_nonlinear & ~locked), (9, locked)):
         exposures = np.flatnonzero(is_selected)
         for start in range(0, len(exposures), BLOCK):
             rows = exposures[start : start + BLOCK]
@@ -391,12 +393,6 @@ def _near_lock(
     distance = np.minimum(second, np.pi - second) if of.is_euler else np.pi / 2 - second
     sd = np.sqrt(np.maximum(covariance[:, 1, 1], covariance[:, 0, 0] * np.sin(distance) ** 2))
     return distance < LOCK_SDS * sd  # False for NaN
-
-
-def _is_nonlinear(covariance: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether angles are too uncertain for linear propagation."""
-    variance = np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2)
-    return np.asarray(variance.max(axis=1) > LINEAR_SD_RAD**2)  # False for NaN
 
 
 def _second_moments(

@@ -224,8 +224,13 @@ class MotionFilter:
         self._predicted: _Step | None = None
         self._pending = self._slope, self._log_variance
 
-    def predict(self, dt_s: float, log_q: NDArray[np.float64] | None = None) -> None:
-        """Predict the next exposure, dt_s later; log_q (B, 2): given densities, if any."""
+    def predict(
+        self, dt_s: float, log_q: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Predict the next exposure, dt_s later; log_q (B, 2): given densities, if any.
+
+        Returns rotations (B, 3, 3), centres (B, 3) and covariances (B, 6, 6) of the poses.
+        """
         count = len(self.alive)
         if self.steps and self.steps[-1].started.any():
             self._limit_start(dt_s, self.steps[-1])
@@ -256,13 +261,7 @@ class MotionFilter:
             log_q=self.log_q,
             started=np.zeros(count, dtype=bool),
         )
-
-    @property
-    def prediction(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Predicted rotations (B, 3, 3), centres (B, 3) and covariances (B, 6, 6) of the poses."""
-        step = self._predicted
-        assert step is not None
-        return step.reference, step.mean[:, :3], step.covariance[:, POSE, POSE]
+        return reference, mean[:, :3], covariance[:, POSE, POSE]
 
     def update(self, seen: PoseInformation, start: NDArray[np.bool_], adapt: bool = True) -> None:
         """Update with an exposure; start (B,): bodies that appear, whose pose it determines.

@@ -278,20 +278,13 @@ class PoseSolver:
                 break
         # The derivatives remain valid; only the residuals change by the last step.
         linear = _after(linear, step)
-        s_vector = _vectors(_weighted(linear, weight), linear.residual)
-        marker = replace(
-            marker,
-            s_vector=s_vector,
-            squares=_squares(linear, weight),
-            ms_vector=(marker.m @ s_vector[..., None])[..., 0],
-        )
         return _Solution(
             rotation,
             centre,
             alone,
             parts=parts,
             linear=linear,
-            marker=marker,
+            marker=self._marker(linear, weight),
         )
 
     def _marker(self, linear: Linear, weight: NDArray[np.float64]) -> _Marker:
@@ -581,20 +574,10 @@ def marker_sums(
     linear: Linear, weight: NDArray[np.float64]
 ) -> tuple[np.ndarray, NDArray[np.float64]]:
     """Return S (B, M, 3, 3) and s (B, M, 3) of markers."""
-    weighted = _weighted(linear, weight)
-    s_matrix = weighted @ linear.by_place.reshape(*weight.shape[:2], -1, 3)
-    return s_matrix, _vectors(weighted, linear.residual)
-
-
-def _weighted(linear: Linear, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return A'W (B, M, 3, 2 F) of markers."""
-    weighted = linear.by_place * weight[..., None, None]
-    return np.swapaxes(weighted.reshape(*weight.shape[:2], -1, 3), 2, 3)
-
-
-def _vectors(weighted: NDArray[np.float64], residual: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vectors s (B, M, 3) of markers."""
-    return (weighted @ residual.reshape(*weighted.shape[:2], -1, 1))[..., 0]
+    rows = (*weight.shape[:2], -1)
+    weighted = np.swapaxes((linear.by_place * weight[..., None, None]).reshape(*rows, 3), 2, 3)
+    s_matrix = weighted @ linear.by_place.reshape(*rows, 3)
+    return s_matrix, (weighted @ linear.residual.reshape(*rows, 1))[..., 0]
 
 
 def _squares(linear: Linear, weight: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -773,14 +773,11 @@ def places_of(
     """
     views = points[0]['uv'].shape[1] if len(points) else 0
     shape = (len(target_ids), len(body.target_id))
-    xyz = np.full((*shape, 3), np.nan)
-    noise = np.full((*shape, 3, 3), np.nan)
-    fixed = np.full((*shape, 3, 3), np.nan)
-    uv = np.full((*shape, views, 2), np.nan)
+    parts = {'xyz_mm': (3,), 'noise': (3, 3), 'fixed': (3, 3), 'uv': (views, 2)}
+    out = {name: np.full((*shape, *part), np.nan) for name, part in parts.items()}
     for row, (ids, values) in enumerate(zip(target_ids, points)):
         _, columns, rows = np.intersect1d(body.target_id, ids, return_indices=True)
-        xyz[row, columns] = values['xyz_mm'][rows]
-        noise[row, columns] = values['noise'][rows]
-        fixed[row, columns] = values['fixed'][rows]
-        uv[row, columns] = values['uv'][rows]
-    return BodyPlaces(xyz, noise, fixed, alike=covariance_of_means(uv).mean(axis=0))
+        for name, array in out.items():
+            array[row, columns] = values[name][rows]
+    alike = covariance_of_means(out['uv']).mean(axis=0)
+    return BodyPlaces(out['xyz_mm'], out['noise'], out['fixed'], alike=alike)

@@ -136,8 +136,7 @@ class BodyTracker:
         if self._expected is not None and self._expected[0] == stamp_ns:
             return self._expected[1]
         dt_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) / NS_PER_S
-        self.filter.predict(dt_s)
-        rotation, centre, covariance = self.filter.prediction
+        rotation, centre, covariance = self.filter.predict(dt_s)
         variance = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
         known = self.filter.alive & (variance < LOST_SD_RAD**2)
         expected = Prediction(rotation, centre, covariance, known, self._weak + 1)

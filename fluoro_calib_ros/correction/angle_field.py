@@ -42,7 +42,6 @@ class _Change:
     #: (k, 2, 10) of the functions, for u and v: first the change, then fields of its uncertainty
     coefficients: NDArray[np.float64]
     variance: NDArray[np.float64]  #: (33, 33) on the grid of the standard deviation [px^2]
-    scatters: bool  #: whether there are fields of uncertainty
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ class AngleField:
         change = self._unknown if np.isnan(angle) else self._known(angle)
         values = self._values(uv, change.coefficients)
         variance = at_sd_grid(change.variance, uv, self.image_size)
-        if change.scatters:
+        if values.shape[1] > 1:  # there are fields of uncertainty
             variance = variance + np.einsum('nka,nka->n', values[:, 1:], values[:, 1:]) / 2
         return values[:, 0], variance
 
@@ -191,7 +190,7 @@ class AngleField:
         factors = np.concatenate([2 * weights, products[j, k] * np.where(j == k, 1, 2)])
         coefficients = np.tensordot(fields, self.coefficients, axes=1)
         variance = np.tensordot(factors, self.variances, axes=1)
-        return _Change(coefficients, variance, len(fields) > 1)
+        return _Change(coefficients, variance)
 
     def _values(
         self, uv: NDArray[np.float64], coefficients: NDArray[np.float64]

@@ -289,12 +289,11 @@ def _cell_sizes(smoothness: Smoothness, image_size: tuple[int, int]) -> list[flo
 
 def _nodes(image_size: tuple[int, int], size: float, parts: int) -> Nodes:
     """Return the corners of cells of at most size / parts [px], from edge to edge of an image."""
-    width, height = image_size
-    return _axis_nodes(width, size, parts), _axis_nodes(height, size, parts)
-
-
-def _axis_nodes(length: int, size: float, parts: int) -> NDArray[np.float64]:
-    return np.linspace(-0.5, length - 0.5, parts * max(1, int(np.ceil(length / size))) + 1)
+    u, v = (
+        np.linspace(-0.5, length - 0.5, parts * max(1, int(np.ceil(length / size))) + 1)
+        for length in image_size
+    )
+    return u, v
 
 
 def _pixels(nodes: Nodes) -> NDArray[np.float64]:

@@ -234,10 +234,8 @@ def stack_image_points(
     ids = np.array(target_id)
     columns = {'u': np.array(u), 'v': np.array(v)}
     deviations = np.array(sigma)
-    if len(deviations):
-        error = length_error(ids, **columns, sigma=deviations)
-    else:
-        error = length_error(ids, **columns)
+    given = {'sigma': deviations} if len(deviations) else {}
+    error = length_error(ids, **columns, **given)
     if error:
         raise DataError(error)
     uv = np.column_stack([columns['u'], columns['v']]).astype(float)

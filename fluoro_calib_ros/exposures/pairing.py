@@ -247,8 +247,8 @@ class CompletePairer(Pairer):
         self._waiting: dict[str, OrderedDict[int, Any]] = {
             name: OrderedDict() for name in self.fluoroscopes
         }
-        # Stamps of these frames in ascending order, if they are paired by stamp.
-        self._stamps: dict[str, list[int]] = {name: [] for name in self.fluoroscopes}
+        # Keys of these frames in ascending order.
+        self._keys: dict[str, list[int]] = {name: [] for name in self.fluoroscopes}
         # Key of the last displaced frame.
         self._displaced: dict[str, int | None] = dict.fromkeys(self.fluoroscopes)
         # Keys and stamps of the newest frames.
@@ -274,8 +274,8 @@ class CompletePairer(Pairer):
         newest.append((key, frame.stamp_ns))
         if key in waiting:
             self.unpaired[name] += 1  # the previous frame with the same key, which is replaced
-        elif not self._by_number:
-            insort(self._stamps[name], key)
+        else:
+            insort(self._keys[name], key)
         waiting[key] = frame
         exposure = self._complete(key)
         if exposure is not None:
@@ -288,9 +288,8 @@ class CompletePairer(Pairer):
 
     def _take(self, name: str, key: int) -> Any:
         """Remove and return a waiting frame."""
-        if not self._by_number:
-            stamps = self._stamps[name]
-            del stamps[bisect_left(stamps, key)]
+        keys = self._keys[name]
+        del keys[bisect_left(keys, key)]
         return self._waiting[name].pop(key)
 
     def _complete(self, key: int) -> Exposure | None:
@@ -320,12 +319,10 @@ class CompletePairer(Pairer):
 
     def _partner(self, name: str, key: int) -> int | None:
         """Return the key of the waiting frame of a fluoroscope that matches a key, or None."""
-        if self._by_number:
-            return key if key in self._waiting[name] else None
-        stamps = self._stamps[name]
-        index = bisect_left(stamps, key)
-        close = [t for t in stamps[max(index - 1, 0) : index + 1] if abs(t - key) <= self._reach]
-        return min(close, key=lambda stamp: abs(stamp - key), default=None)
+        keys = self._keys[name]
+        index = bisect_left(keys, key)
+        close = [k for k in keys[max(index - 1, 0) : index + 1] if abs(k - key) <= self._reach]
+        return min(close, key=lambda other: abs(other - key), default=None)
 
     def _discard_before(self, frame: PairableFrame) -> None:
         """Discard the frames from before a restart; the frame is the first one after it.
@@ -346,7 +343,7 @@ class CompletePairer(Pairer):
         for name, waiting in self._waiting.items():
             self.unpaired[name] += len(waiting)
             waiting.clear()
-            self._stamps[name].clear()
+            self._keys[name].clear()
         return ()
 
 

@@ -40,6 +40,7 @@ from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.cameras import Cameras
+from ..rows import chosen_rows
 from .sizes import ChangeStatistics
 
 FALSE_SHARE = 0.01  # expected share of false matches among the image points
@@ -103,7 +104,7 @@ class Poses:
 
     def exposures(self, chosen: NDArray[np.int64]) -> Poses:
         """Return a subset of the exposures."""
-        return Poses(self.rotation[chosen], self.centre_mm[chosen], self.known[chosen])
+        return chosen_rows(self, chosen)
 
     def or_else(self, other: Poses, fits: NDArray[np.bool_]) -> Poses:
         """Return these poses where they fit (T, B), and the other ones elsewhere."""

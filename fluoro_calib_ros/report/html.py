@@ -34,7 +34,7 @@ from .report_figures import (
     exposure_bars,
     residual_map,
 )
-from .residuals import Residuals, residuals_of
+from .residuals import Residuals, position_figure, residuals_of
 from .rig_geometry import SpaceAccuracy, beams, drawing, phantom_distance, uncalibrated_share
 from .tables import model_text
 
@@ -328,8 +328,10 @@ def _figures(
         )
         figures.append(('Distortion and its standard deviation', field_figure))
     if residuals.inlier.any():
+        title = f'{name}: residuals over the image'
+        stages = ((stage, residuals.inlier) for stage in (residuals.before, residuals.after))
         figures += [
-            (RESIDUALS, residuals.by_position(name, size)),
+            (RESIDUALS, position_figure(title, residuals.uv, *stages, size)),
             ('Residuals and coverage', residual_map(residuals, name, size)),
             ('RMS and number of beads by exposure', exposure_bars(residuals, name)),
             ('Distribution of the residuals', distribution(residuals, name)),

@@ -47,12 +47,6 @@ class Residuals:
             )
         return statistics
 
-    def by_position(self, name: str, image_size: tuple[int, int]) -> Figure:
-        """Return the figure of the residuals over the columns and rows of the image."""
-        title = f'{name}: residuals over the image'
-        before = (self.before, self.inlier)
-        return position_figure(title, self.uv, before, (self.after, self.inlier), image_size)
-
 
 def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float('nan')

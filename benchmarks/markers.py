@@ -200,10 +200,13 @@ class Record:
 
 
 def expected_light(
-    radiography: MarkerRadiography, frame: int, rows: np.ndarray, *shift_mm: tuple[float, ...]
+    radiography: MarkerRadiography,
+    frame: int,
+    rows: np.ndarray,
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> np.ndarray:
-    """Return the expected light (h, w) of markers in rows (k,), 1 in the open beam."""
-    light, _, _ = radiography._light(frame, rows, *shift_mm)
+    """Return the expected light (h, w) of shifted markers in rows (k,), 1 in the open beam."""
+    light, _, _ = radiography._light(frame, rows, shift_mm)
     return detected(light, radiography.settings)
 
 

@@ -427,7 +427,8 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         r = (forward @ r[:, :, None])[:, :, 0]
         n = forward @ n @ step.into
     log_q = np.stack([step.log_q for step in steps])
-    motion = Motion(*(np.stack(values) for values in zip(*rows[::-1])), log_q=log_q)
+    rotation, centre, velocity, acceleration, covariance = map(np.stack, zip(*rows[::-1]))
+    motion = Motion(rotation, centre, velocity, acceleration, covariance, log_q)
     return motion, _Scores(*np.stack(scores[::-1], axis=1))
 
 

@@ -90,7 +90,11 @@ class ExposureCollector:
     def __init__(self, fluoroscopes: Iterable[str], still: StillOptions | None = None) -> None:
         self.fluoroscopes = tuple(fluoroscopes)
         self.still = still or StillOptions()
-        self.reset()
+        self.exposures: list[Pair] = []
+        self.coverage: dict[str, Coverage] = {}
+        self._recent: deque[Pair] = deque(maxlen=MAX_RECENT)
+        self._streaming = False
+        self._single: Pair | None = None  # collected as a single shot, but may begin a stream
 
     def offer(self, pair: Pair) -> str:
         """Collect a pair if the phantom stands still in a new pose.
@@ -177,11 +181,11 @@ class ExposureCollector:
 
     def reset(self) -> None:
         """Discard all exposures."""
-        self.exposures: list[Pair] = []
-        self.coverage: dict[str, Coverage] = {}
-        self._recent: deque[Pair] = deque(maxlen=MAX_RECENT)
+        self.exposures = []
+        self.coverage = {}
+        self._recent.clear()
         self._streaming = False
-        self._single: Pair | None = None  # collected as a single shot, but may begin a stream
+        self._single = None
 
     def frames(self, fluoroscopes: Iterable[str] | None = None) -> dict[str, list[Frame]]:
         """Return the collected frames by fluoroscope.

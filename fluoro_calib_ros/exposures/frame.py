@@ -149,9 +149,9 @@ def _frame_error(frame: Frame, phantom: Phantom | None, image_size: tuple[int, i
         return f'{len(ids)} target ids, but image points of shape {uv.shape}'
     if frame.sigma is not None and len(frame.sigma) != len(ids):
         return length_error(ids, sigma=frame.sigma)
-    finite = np.isfinite(uv).all(axis=1)
+    finite = np.asarray(np.isfinite(uv).all(axis=1))
     on_image = points_on_image(uv, frame.image_size)
-    on_phantom = [] if phantom is None else phantom.index(ids) >= 0
+    known = np.full(len(ids), True) if phantom is None else phantom.index(ids) >= 0
     outside = f'target {{}} is outside the image of {width} x {height} px'
     return (
         angle_error(frame.angle)
@@ -159,7 +159,7 @@ def _frame_error(frame: Frame, phantom: Phantom | None, image_size: tuple[int, i
         or ('' if frame.sigma is None else sigma_error(ids, frame.sigma))
         or _first_error(ids, on_image, outside)
         or repeated_target_error(ids)
-        or _first_error(ids, np.asarray(on_phantom), 'target {} is not on the phantom')
+        or _first_error(ids, np.asarray(known), 'target {} is not on the phantom')
     )
 
 

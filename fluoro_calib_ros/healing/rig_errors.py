@@ -84,8 +84,8 @@ class _Intersected:
         for f in range(views):
             by_rig[:, f, :, f] = by_orientation[:, f]
         transposed = np.swapaxes(by_place, 1, 2)
-        by_uv = np.linalg.solve(transposed @ by_place, transposed)
-        return cls(uv, by_rig.reshape(*by_rig.shape[:3], -1), by_uv)
+        by_uv = np.asarray(np.linalg.solve(transposed @ by_place, transposed), dtype=float)
+        return cls(np.asarray(uv), by_rig.reshape(*by_rig.shape[:3], -1), by_uv)
 
     def moved(self, derivatives: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the motion of points (3n, k), from derivatives (n, F, 2, k) of their views."""

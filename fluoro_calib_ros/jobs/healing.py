@@ -284,7 +284,7 @@ class _Rig:
         pixel = values[..., :2]
         uv = values[..., 2:4]
         sigma, correction = np.moveaxis(values[..., 4:], -1, 0)
-        seen = np.isfinite(values).all(axis=-1)
+        seen = np.asarray(np.isfinite(values).all(axis=-1))
         count = np.maximum(seen.sum(axis=0), 1)
         fixed = np.where(seen, correction, 0.0) ** 2
         noise = np.where(seen, np.maximum(sigma**2 - correction**2, 0.01 * sigma**2), 1.0)

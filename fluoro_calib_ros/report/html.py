@@ -329,9 +329,9 @@ def _figures(
         figures.append(('Distortion and its standard deviation', field_figure))
     if residuals.inlier.any():
         title = f'{name}: residuals over the image'
-        stages = ((stage, residuals.inlier) for stage in (residuals.before, residuals.after))
+        before, after = (residuals.before, residuals.inlier), (residuals.after, residuals.inlier)
         figures += [
-            (RESIDUALS, position_figure(title, residuals.uv, *stages, size)),
+            (RESIDUALS, position_figure(title, residuals.uv, before, after, size)),
             ('Residuals and coverage', residual_map(residuals, name, size)),
             ('RMS and number of beads by exposure', exposure_bars(residuals, name)),
             ('Distribution of the residuals', distribution(residuals, name)),

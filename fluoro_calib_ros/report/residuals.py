@@ -89,7 +89,8 @@ def residuals_of(
                 calibration.interior,
             )
         )
-    numbers, ids, observed, expected = map(np.concatenate, (exposure, target_id, uv, computed))
+    numbers, ids = np.concatenate(exposure), np.concatenate(target_id)
+    observed, expected = np.concatenate(uv), np.concatenate(computed)
     angles = np.concatenate(angle)
     corrected = calibration.correct(observed, exact=True, angle=angles).uv
     inlier = np.array([pair not in outliers for pair in zip(numbers.tolist(), ids.tolist())])

@@ -428,7 +428,7 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         n = forward @ n @ step.into
     log_q = np.stack([step.log_q for step in steps])
     rotation, centre, velocity, acceleration, covariance = map(np.stack, zip(*rows[::-1]))
-    motion = Motion(rotation, centre, velocity, acceleration, covariance, log_q)
+    motion = Motion(rotation, centre, velocity, acceleration, covariance=covariance, log_q=log_q)
     return motion, _Scores(*np.stack(scores[::-1], axis=1))
 
 

@@ -62,7 +62,8 @@ class Prediction:
     """Expected poses: rotations (B, 3, 3), centres (B, 3) [mm], covariances (B, 6, 6).
 
     known (B,): whether there is one. weak (B,): number of exposures since one alone gave the pose,
-    including the expected one.
+    including the expected one. near (B,): whether an iteration may start at a pose that is not
+    known, that of a body that has just appeared; None for no body.
     """
 
     rotation: NDArray[np.float64]
@@ -70,6 +71,7 @@ class Prediction:
     covariance: NDArray[np.float64]
     known: NDArray[np.bool_]
     weak: NDArray[np.int64]
+    near: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -162,8 +164,11 @@ class PoseSolver:
         rotation = np.where(prediction.known[:, None, None], prediction.rotation, np.eye(3))
         centre = np.where(prediction.known[:, None], prediction.centre_mm, 0.0)
         started = prediction.known.copy()
+        near = np.zeros_like(started)
         if not started.all():
-            self._start(exposure, points, np.flatnonzero(~started), (rotation, centre, started))
+            pose = rotation, centre, started
+            self._start(exposure, points, np.flatnonzero(~started), pose)
+            near = _start_nearby(points, prediction, pose)
         seen = points.seen.any(axis=2)
         used = seen & started[:, None]
         test = np.full(used.shape, np.nan)
@@ -187,6 +192,7 @@ class PoseSolver:
             if not len(contradicting):
                 break
             used[contradicting, worst] = False
+            used[contradicting[near[contradicting]]] = False  # it may have been elsewhere
         ambiguous = self._ambiguous(solution, points, used, prediction)
         return self._result(solution, (points, used), prediction, test, ambiguous)
 
@@ -408,6 +414,26 @@ class PoseSolver:
             chi2=np.sum(_own_squares(solution.marker, self.variance), axis=1),
             freedom=2.0 * np.sum(points.seen & used[..., None], axis=(1, 2)) - POSE_SIZE,
         )
+
+
+def _start_nearby(
+    points: ImagePoints,
+    prediction: Prediction,
+    pose: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]],
+) -> NDArray[np.bool_]:
+    """Start bodies near which they may be; return which ones (B,).
+
+    They need more coordinates than a pose has, so that a false one is noticed. pose: as in
+    `PoseSolver._start`; modified in place.
+    """
+    rotation, centre, started = pose
+    near = np.zeros_like(started)
+    if prediction.near is not None:
+        near = prediction.near & ~started & (2 * points.seen.sum(axis=(1, 2)) > POSE_SIZE)
+        rotation[near] = prediction.rotation[near]
+        centre[near] = prediction.centre_mm[near]
+        started |= near
+    return near
 
 
 def _excludes(prediction: Prediction, row: int, second: _Solution, limit: float) -> bool:

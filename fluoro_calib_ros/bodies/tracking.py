@@ -120,7 +120,8 @@ class BodyTracker:
         self._stamp_ns = stamp_ns
         frame = self.solver.solve(exposure, expected)
         self._weak = np.where(frame.alone, 0, expected.weak)
-        # A body that has just appeared has no useful prediction yet, as its speed is unknown.
+        # A body that has just appeared has no useful prediction yet, as its speed is unknown: it
+        # is near its last pose, and lost unless this exposure alone gives its pose.
         variance = np.diagonal(expected.covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
         angle = rotation_angle(frame.rotation @ np.swapaxes(expected.rotation, 1, 2))
         is_elsewhere = (variance > 3 * UNKNOWN_RAD2) | (angle > ELSEWHERE_RAD)
@@ -139,7 +140,8 @@ class BodyTracker:
         rotation, centre, covariance = self.filter.predict(dt_s)
         variance = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
         known = self.filter.alive & (variance < LOST_SD_RAD**2)
-        expected = Prediction(rotation, centre, covariance, known, self._weak + 1)
+        near = self.filter.alive & ~known
+        expected = Prediction(rotation, centre, covariance, known, self._weak + 1, near)
         self._expected = stamp_ns, expected
         return expected
 

@@ -3,6 +3,8 @@
 
 """Poses from one exposure: scatter against covariance, bound, scipy, and false markers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from body_views import Noise, body, exposure, observed, orientation, project
@@ -409,3 +411,34 @@ def test_observations_with_an_error_in_common_tell_no_more_than_it_allows():
     told = np.sum(1 / _variance_of_last(np.array(noise), np.array(common), number))
     covariance = noise * np.eye(20) + common
     assert told == pytest.approx(np.sum(np.linalg.inv(covariance)), rel=1e-9)
+
+
+@pytest.mark.parametrize('false_px', [0.0, 20.0])
+def test_iteration_starts_near_a_body_unless_its_markers_contradict_each_other(false_px):
+    """Two of the four markers are in space, the others only in one view."""
+    rng = np.random.default_rng(9)
+    rig = orientation()
+    for _ in range(20):
+        given = body(rng, 4)
+        rotation, centre = random_pose(rng)
+        points = (given.xyz_mm - given.centre) @ rotation.T + centre
+        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+        uv[1, 2:] = np.nan
+        uv[0, 2] += false_px
+        away = Rotation.from_rotvec(rng.normal(0, 0.2, 3)).as_matrix()
+        near = replace(
+            UNKNOWN,
+            rotation=(away @ rotation)[None],
+            centre_mm=(centre + rng.normal(0, 5, 3))[None],
+            near=np.ones(1, dtype=bool),
+        )
+        seen = exposure(rig, given.target_id, uv, Noise(0.2))
+        solver = PoseSolver(rig, [given])
+        assert not solver.solve(seen, UNKNOWN).alone[0]
+        found = solver.solve(seen, near)
+        if false_px:
+            assert not found.alone[0] and not found.markers[0]
+        else:
+            assert found.markers[0] == 4
+            turn = vector_from_matrix(found.rotation[0] @ rotation.T)
+            assert np.linalg.norm(turn) < 0.1 and np.abs(found.centre_mm[0] - centre).max() < 1

@@ -50,11 +50,11 @@ class Trial:
                 hidden(k, uv)
             self.exposures.append(exposure(self.rig, self.ids, uv, Noise(0.2)))
 
-    def follow(self, lag=None):
-        """The tracker and its reports."""
+    def follow(self, lag=None, rate=RATE):
+        """The tracker and its reports; rate: of the exposures [Hz]."""
         tracker = BodyTracker(self.rig, self.bodies, lag=lag)
         found = [
-            tracker.add(one, k, 1 + round(1e9 * k / RATE)) for k, one in enumerate(self.exposures)
+            tracker.add(one, k, 1 + round(1e9 * k / rate)) for k, one in enumerate(self.exposures)
         ]
         return tracker, [one for one in found if one is not None]
 
@@ -68,6 +68,22 @@ class Trial:
             axis=1,
         )
         return away, poses.sd
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_body_is_followed_from_its_first_pose_although_its_speed_is_unknown(seed):
+    """At 100 Hz any speed is a turn by 23 degrees in an exposure; half of the exposures have fewer
+    than three markers in space."""
+    trial = Trial(seed, lost=0.25)
+    tracker, _ = trial.follow(rate=100.0)
+    poses = poses_of(trial.bodies, tracker.smoothed())
+    for row, found in enumerate(poses):
+        alone = np.flatnonzero(found.status == PoseStatus.OK)
+        assert alone[0] < 10 and len(alone) > 0.8 * COUNT
+        assert (found.status[alone[0] :] != PoseStatus.FAILED).sum() > 0.95 * (COUNT - alone[0])
+        error = found.position_mm[alone] - trial.position[row][alone]
+        assert np.abs(error).max() < 0.5
+
 
 
 def test_one_image_point_a_view_is_never_believed_to_give_the_pose():

@@ -503,13 +503,16 @@ class _Table:
     """Image points of the frames of a fluoroscope by frame and target, NaN where not seen."""
 
     def __init__(self, frames: Sequence[Frame]) -> None:
-        ids = np.unique(np.concatenate([frame.target_id for frame in frames]))
+        self.ids = np.unique(np.concatenate([frame.target_id for frame in frames]))
         self._row = {frame.number: row for row, frame in enumerate(frames)}
-        self._uv = np.full((len(frames), len(ids), 2), np.nan)
+        values = np.full((len(frames), len(self.ids), 3), np.nan)
+        self.uv, self.sigma = values[..., :2], values[..., 2]
         self._angle = np.array([np.nan if f.angle is None else f.angle for f in frames])
-        for frame_uv, frame in zip(self._uv, frames):
-            frame_uv[np.searchsorted(ids, frame.target_id)] = frame.uv
-        self._seen = np.isfinite(self._uv[..., 0]).astype(float)
+        for row, frame in zip(values, frames):
+            columns = np.searchsorted(self.ids, frame.target_id)
+            row[columns, :2] = frame.uv
+            row[columns, 2] = np.nan if frame.sigma is None else frame.sigma
+        self._seen = np.isfinite(self.uv[..., 0]).astype(float)
         self._count = self._seen.sum(axis=1)
 
     def compare(
@@ -525,7 +528,7 @@ class _Table:
         common = self._seen[rows] @ self._seen[row]
         min_common = SHARE * np.minimum(self._count[rows], self._count[row])
         comparable = np.flatnonzero(common >= np.maximum(MIN_COMMON_TARGETS, min_common))
-        distance = np.linalg.norm(self._uv[rows[comparable]] - self._uv[row], axis=2)
+        distance = np.linalg.norm(self.uv[rows[comparable]] - self.uv[row], axis=2)
         # A median is small only if half of the distances are; few need it.
         near = 2 * np.count_nonzero(distance <= STILL_PX, axis=1) >= common[comparable]
         is_still = np.zeros(len(rows), dtype=bool)
@@ -541,15 +544,9 @@ def _joined(frames: Sequence[Frame], number: int) -> Frame:
     first_frame = frames[0]
     if len(frames) == 1:
         return first_frame if first_frame.number == number else replace(first_frame, number=number)
-    ids = np.unique(np.concatenate([frame.target_id for frame in frames]))
-    values = np.full((len(frames), len(ids), 3), np.nan)
-    for frame_values, frame in zip(values, frames):
-        columns = np.searchsorted(ids, frame.target_id)
-        frame_values[columns, :2] = frame.uv
-        if frame.sigma is not None:
-            frame_values[columns, 2] = frame.sigma
+    table = _Table(frames)
     sigma = None
     if all(frame.sigma is not None for frame in frames):
-        sigma = np.nanmedian(values[..., 2], axis=0)
-    uv = np.nanmedian(values[..., :2], axis=0)
-    return replace(first_frame, number=number, target_id=ids, uv=uv, sigma=sigma)
+        sigma = np.nanmedian(table.sigma, axis=0)
+    uv = np.nanmedian(table.uv, axis=0)
+    return replace(first_frame, number=number, target_id=table.ids, uv=uv, sigma=sigma)

@@ -277,6 +277,13 @@ def _draw_image_frame(axes: Axes, image_size: Sequence[int]) -> None:
     axes.grid(False)
 
 
+def image_axes(image_size: Sequence[int]) -> dict[str, Any]:
+    """Return limits and labels of axes that show an image, v downwards."""
+    width, height = image_size
+    limits = {'xlim': (-0.5, width - 0.5), 'ylim': (height - 0.5, -0.5)}
+    return {**limits, 'xlabel': 'column u [px]', 'ylabel': 'row v [px]'}
+
+
 def _draw_arrows(
     axes: Axes, model: CorrectionModel, image_size: Sequence[int], largest: float
 ) -> float:
@@ -378,8 +385,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
     figure = new_figure(7.5 * len(comparisons), 7, 'Difference of the corrections, without gauge')
     panels = figure.subplots(1, len(comparisons), squeeze=False)[0]
     for axes, comparison in zip(panels, comparisons):
-        width, height = comparison.image_size
-        step = max(width, height) / ARROWS
+        step = max(comparison.image_size) / ARROWS
         mesh = axes.scatter(
             *comparison.uv.T, c=comparison.size, cmap='YlOrRd', s=40, marker='s', vmin=0
         )
@@ -400,9 +406,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
             scale=1,
             width=0.003,
         )
-        axes.set_xlim(-0.5, width - 0.5)
-        axes.set_ylim(height - 0.5, -0.5)
-        axes.set(aspect='equal', xlabel='column u [px]', ylabel='row v [px]')
+        axes.set(**image_axes(comparison.image_size), aspect='equal')
         axes.set_title(
             f'{comparison.fluoroscope}: arrows magnified {factor:g} times,\ndots: significant'
         )

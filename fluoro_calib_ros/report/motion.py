@@ -67,7 +67,11 @@ def _series(
         figure = new_figure(10, 6, title)
         axes = figure.subplots(2, 3, sharex=True)
         for number, (name, panel) in enumerate(zip(names, axes.ravel().tolist())):
-            _draw(panel, time_s, values[:, number], sd[:, number])
+            curve, band = values[:, number], BAND * sd[:, number]
+            panel.fill_between(
+                time_s, curve - band, curve + band, color=RED, alpha=0.3, linewidth=0
+            )
+            panel.plot(time_s, curve, color=BLUE, linewidth=1.2)
             panel.set_title(name)
             if filled.any():
                 panel.fill_between(
@@ -88,15 +92,6 @@ def _series(
             fontsize=9,
         )
     return figure
-
-
-def _draw(
-    axes: Axes, time_s: NDArray[np.float64], values: NDArray[np.float64], sd: NDArray[np.float64]
-) -> None:
-    axes.fill_between(
-        time_s, values - BAND * sd, values + BAND * sd, color=RED, alpha=0.3, linewidth=0
-    )
-    axes.plot(time_s, values, color=BLUE, linewidth=1.2)
 
 
 def paths_figure(poses: Sequence[BodyPoses]) -> Figure:

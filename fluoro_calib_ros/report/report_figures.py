@@ -33,6 +33,7 @@ from .figures import (
     Scale,
     common_scale,
     distortion_figure,
+    image_axes,
     new_figure,
     png_bytes,
 )
@@ -139,9 +140,7 @@ def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -
     axes.quiver(u, v, du, dv, angles='xy', scale_units='xy', scale=1, color=AFTER, width=0.0015)
     outlier_uv = residuals.uv[~residuals.inlier]
     axes.plot(*outlier_uv.T, 'x', color=BEFORE, markersize=4, label=f'{len(outlier_uv)} outliers')
-    axes.set(xlabel='column u [px]', ylabel='row v [px]')
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
+    axes.set(**image_axes(image_size))
     axes.grid(False)
     axes.set_title(f'arrows magnified {factor:g} times; grey: no bead was seen here')
     if len(outlier_uv):

@@ -81,7 +81,6 @@ class MarkerImage:
 class _Disc:
     """A metal disc that hides a marker from a fluoroscope in some images."""
 
-    fluoroscope: str
     marker: int
     first: float
     last: float
@@ -167,7 +166,7 @@ class MarkerRadiography(Radiography):
         self.seed = seed
         name = sum(fluoroscope.name.encode())
         rng = np.random.default_rng([seed, 22, name])
-        self._discs = _discs(rng, fluoroscope.name, markers, frames)
+        self._discs = _discs(rng, markers, frames)
         if self.settings.clutter:
             self._open_beam *= clutter(rng, self._open_beam.shape, self.settings.clutter)
         self._plane = self._rays[..., :2].astype(np.float32)
@@ -345,9 +344,7 @@ def _ellipsoid_path(
     return 2 * np.sqrt(np.maximum(b * b - a * c, 0)) / a
 
 
-def _discs(
-    rng: np.random.Generator, fluoroscope: str, markers: MovingMarkers, frames: int
-) -> list[_Disc]:
+def _discs(rng: np.random.Generator, markers: MovingMarkers, frames: int) -> list[_Disc]:
     """Draw when markers are hidden, excluding the first images."""
     discs = []
     mean = 0.5 * sum(HIDDEN_FRAMES)
@@ -361,7 +358,6 @@ def _discs(
         marker = int(rng.integers(len(markers.target_id)))
         discs.append(
             _Disc(
-                fluoroscope,
                 marker,
                 first=first,
                 last=first + length,

@@ -327,12 +327,8 @@ class RigServices(Worker):
 
     def __init__(self, parts: NodeParts) -> None:
         super().__init__(parts.node)
-        self._node = parts.node
-        self._rig = parts.rig
-        self._exposures = parts.exposures
-        self._output = parts.output
-        self._files = parts.files
-        self._requests = parts.requests
+        self._node, self._rig, self._exposures = parts.node, parts.rig, parts.exposures
+        self._output, self._files, self._requests = parts.output, parts.files, parts.requests
         self._logger = parts.node.get_logger()
 
 

@@ -266,24 +266,18 @@ def services_qos() -> QoSProfile:
 
 def adapted_qos(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
     """Return the profile for receiving the messages of all given publishers."""
-    profiles = [publisher.qos_profile for publisher in publishers]
-    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
-    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
+    return received_by_all(QoSProfile(depth=depth), publishers)
 
 
 def received_by_all(current: QoSProfile, publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
     """Return the profile of a subscription that is to receive the messages of all publishers."""
     qos = copy(current)
-    if publishers:
-        offered = adapted_qos(publishers, current.depth)
-        qos.reliability = offered.reliability
-        qos.durability = offered.durability
+    profiles = [publisher.qos_profile for publisher in publishers]
+    if profiles:
+        reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+        latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+        qos.reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        qos.durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
     return qos
 
 

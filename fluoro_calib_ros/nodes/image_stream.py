@@ -9,6 +9,7 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -334,25 +335,17 @@ class ExtractionWorkers:
 
     def _serve(self, names: Collection[str], process: WorkerProcess) -> None:
         """Extract the images of the given fluoroscopes, exposure by exposure."""
-        lent = LentArrays()
-        try:
-            self._serve_exposures(names, process, lent)
-        finally:
-            lent.close()
-
-    def _serve_exposures(
-        self, names: Collection[str], process: WorkerProcess, lent: LentArrays
-    ) -> None:
-        while (exposure := self._queue.get(names, PATIENCE_S)) is not None:
-            number, tasks = exposure
-            try:
-                self._extract(number, tasks, process, lent)
-            except Exception as error:  # this exposure is lost, the next ones are not
-                if self._queue.closed:
-                    return  # the process has been ended
-                for name in tasks:
-                    stream = self._streams[name]
-                    stream.refusals.fail(stream.topic, error)
+        with closing(LentArrays()) as lent:
+            while (exposure := self._queue.get(names, PATIENCE_S)) is not None:
+                number, tasks = exposure
+                try:
+                    self._extract(number, tasks, process, lent)
+                except Exception as error:  # this exposure is lost, the next ones are not
+                    if self._queue.closed:
+                        return  # the process has been ended
+                    for name in tasks:
+                        stream = self._streams[name]
+                        stream.refusals.fail(stream.topic, error)
 
     def _extract(
         self, number: int, tasks: Mapping[str, Task], process: WorkerProcess, lent: LentArrays

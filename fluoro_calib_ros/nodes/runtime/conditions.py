@@ -80,6 +80,7 @@ def state_of(
     stream: Stream,
     topics: Iterable[str],
     subject: str,
+    *,
     counts: Mapping[str, int] | None = None,
     **values: Any,
 ) -> Kind:

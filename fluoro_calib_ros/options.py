@@ -76,14 +76,8 @@ def option(
     choices may be a function, which is called whenever the options are declared, so that a growing
     registry is always up to date.
     """
-    declaration = {
-        'description': description,
-        'choices': choices,
-        'minimum': minimum,
-        'maximum': maximum,
-        'unit': unit,
-        'length': length,
-    }
+    limits = (minimum, maximum, unit, length)
+    declaration = Option('', default, description, choices, *limits)  # type: ignore[arg-type]
     return dataclasses.field(default=default, metadata={_KEY: declaration})
 
 
@@ -92,10 +86,10 @@ def declared(options: type | object) -> dict[str, Option]:
     out = {}
     for field in dataclasses.fields(options):  # type: ignore[arg-type]
         if _KEY in field.metadata:
-            declaration = dict(field.metadata[_KEY])
-            choices = declaration['choices']
-            declaration['choices'] = tuple(choices() if callable(choices) else choices)
-            out[field.name] = Option(field.name, field.default, **declaration)
+            declaration = field.metadata[_KEY]
+            choices = declaration.choices
+            choices = tuple(choices() if callable(choices) else choices)
+            out[field.name] = dataclasses.replace(declaration, name=field.name, choices=choices)
     return out
 
 

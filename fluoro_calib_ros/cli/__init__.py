@@ -134,39 +134,22 @@ class _Parser(argparse.ArgumentParser):
             ) from None
 
 
-class _WholeHelp(argparse.Action):
-    """Prints the help with all options, and exits."""
+class _Print(argparse.Action):
+    """Prints the text that const returns for the parser and the value, and exits."""
 
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
-        print(argparse.ArgumentParser.format_help(parser), end='')
+    def __call__(self, parser: argparse.ArgumentParser, _: Any, value: Any, *__: Any) -> None:
+        print(self.const(parser, value).rstrip('\n'))
         parser.exit()
 
 
-class _Version(argparse.Action):
-    """Prints the versions, which are looked up only on demand."""
+def _versions(*_: object) -> str:
+    """Return the versions, which are looked up only on demand."""
+    from ..report.html import versions
 
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
-        from ..report.html import versions
-
-        package_versions = versions()
-        program_version = package_versions.pop('fluoro_calib_ros')
-        dependencies = ', '.join(f'{name} {version}' for name, version in package_versions.items())
-        print(f'fluoro_calib_ros {program_version} ({dependencies})')
-        parser.exit()
-
-
-class _Completion(argparse.Action):
-    """Prints the completion script for a shell, and exits."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        print(completion_script(make_parser(), values))
-        parser.exit()
+    package_versions = versions()
+    program_version = package_versions.pop('fluoro_calib_ros')
+    dependencies = ', '.join(f'{name} {version}' for name, version in package_versions.items())
+    return f'fluoro_calib_ros {program_version} ({dependencies})'
 
 
 def make_parser(
@@ -179,10 +162,13 @@ def make_parser(
     of the parser.
     """
     parser = kind(prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.')
-    parser.add_argument('--version', action=_Version, nargs=0, help='print versions and exit')
+    parser.add_argument(
+        '--version', action=_Print, nargs=0, const=_versions, help='print versions and exit'
+    )
     parser.add_argument(
         '--print-completion',
-        action=_Completion,
+        action=_Print,
+        const=lambda _, shell: completion_script(make_parser(), shell),
         choices=SHELLS,
         help='print a script that completes the command line in a shell, and exit',
     )
@@ -197,7 +183,11 @@ def make_parser(
         sub.set_defaults(module=module, parse=parse_words, rig_file=rig)
         if command in (None, module.NAME):
             sub.add_argument(
-                '--help-all', action=_WholeHelp, nargs=0, help='show all options and exit'
+                '--help-all',
+                action=_Print,
+                nargs=0,
+                const=lambda whole, _: argparse.ArgumentParser.format_help(whole),
+                help='show all options and exit',
             )
             sub.add_argument(
                 '--json', action='store_true', help='print the result as JSON on standard output'

@@ -213,6 +213,7 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
     from ..estimation.options import CalibrationOptions, CalibrationRequest
     from ..exposures.names import Names
     from ..io.phantom import has_exposures, read_moving_points
+    from ..jobs.image_sources import contains_images, dose_texts
     from ..jobs.sources import read_orientations, read_survey
 
     known_orientations = read_orientations(arguments.known_orientation, file_settings(arguments))
@@ -228,6 +229,7 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
         frames = recording.frames
         phantom = survey.phantom
         names = recording.names
+    doses = dose_texts(arguments.source) if contains_images(arguments.source) else {}
     request = CalibrationRequest(
         frames,
         phantom,
@@ -240,19 +242,11 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
             'observations': str(arguments.source),
             'phantom': str(arguments.phantom),
             **({'decisions': str(arguments.decisions)} if arguments.decisions else {}),
-            **_doses(arguments.source),
+            **{f'dose {name}'.strip(): text for name, text in doses.items()},
             **((arguments.rig_file and arguments.rig_file.about) or {}),
         },
     )
     return request, recording.radiographs
-
-
-def _doses(source: Path) -> dict[str, str]:
-    """Return dose information of DICOM files, for the report."""
-    from ..jobs.image_sources import contains_images, dose_texts
-
-    texts = dose_texts(source) if contains_images(source) else {}
-    return {f'dose {name}'.strip(): text for name, text in texts.items()}
 
 
 def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recording:

@@ -165,15 +165,10 @@ def _read_cdr(store: Typestore, data: bytes, msg_type: str) -> Any:
         for empty in range(1, 11):
             with suppress(Exception):
                 message = store.deserialize_cdr(data[: -4 * empty], msg_type)
-                if empty <= _count_empty(message):
+                arrays = [v for v in vars(message).values() if isinstance(v, np.ndarray)]
+                if empty <= sum(v.dtype == np.float64 and not len(v) for v in arrays):
                     return message
         raise DataError(f'the content is not a {msg_type} ({error})') from None
-
-
-def _count_empty(message: Any) -> int:
-    """Return the number of empty float64 sequences among the fields of a message."""
-    values = (getattr(message, field.name) for field in dataclasses.fields(message))
-    return sum(isinstance(v, np.ndarray) and v.dtype == np.float64 and not len(v) for v in values)
 
 
 def fields_of(msg_type: str, text: str, encoding: str) -> dict[str, Any]:
@@ -452,7 +447,19 @@ def bag_metadata(
         'duration': total.duration,
         'starting_time': total.starting_time,
         'message_count': total.count,
-        'topics_with_message_count': [_topic_metadata(topic) for topic in topics],
+        'topics_with_message_count': [
+            {
+                'topic_metadata': {
+                    'name': topic.name,
+                    'type': topic.msg_type,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': topic.qos,
+                    'type_description_hash': topic.definition.type_hash,
+                },
+                'message_count': topic.count,
+            }
+            for topic in topics
+        ],
         'compression_format': '',
         'compression_mode': '',  # applies to whole files; chunks are compressed separately
         'relative_file_paths': [file.path for file in files],
@@ -467,17 +474,4 @@ def bag_metadata(
         ],
         'custom_data': None,
         'ros_distro': 'jazzy',
-    }
-
-
-def _topic_metadata(topic: BagTopic) -> dict[str, Any]:
-    return {
-        'topic_metadata': {
-            'name': topic.name,
-            'type': topic.msg_type,
-            'serialization_format': 'cdr',
-            'offered_qos_profiles': topic.qos,
-            'type_description_hash': topic.definition.type_hash,
-        },
-        'message_count': topic.count,
     }

@@ -301,6 +301,13 @@ class FileSettings:
             )
         return UNITS_MM[self.units]
 
+    def unit_stated(self, where: object, unit: str) -> float:
+        """Return the unit in mm, that of the user or else of the file. Raises DataError."""
+        mm = UNITS_MM.get(self.units or unit)
+        if mm is None:
+            raise DataError(f'{where} is {unit!r}, give it with --units')
+        return mm
+
     def unit_or(self, default: str, subject: str) -> tuple[float, tuple[str, ...]]:
         """Return the unit in mm, and a note if it is the default of the format."""
         if self.units is not None:
@@ -344,6 +351,11 @@ class Sample:
     def first(self) -> str:
         """First line that is not blank, '' for a binary file."""
         return self.lines[0] if self.lines else ''
+
+    @property
+    def keys(self) -> set[str]:
+        """Words before the first colon of each line: keys of a YAML file."""
+        return {line.split(':')[0] for line in self.lines}
 
 
 @dataclass(frozen=True)

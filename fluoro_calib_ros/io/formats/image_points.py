@@ -64,7 +64,11 @@ def read_xmalab(path: Path, settings: FileSettings) -> Content:
     sizes = {camera: settings.image_size_of(path, labels[camera]) for camera in cameras}
     column_size = np.array([sizes[camera] for camera in column_camera.tolist()])
     for number, row in zip(frame_numbers(rows, first_column), rows):
-        _check_offsets(row, first_column, offsets)
+        given = Row(row.path, row.line, row.cells[first_column : first_column + offsets])
+        if any(given.numbers()):
+            row.fail(
+                'the cameras are offset against each other in time: export them without offset'
+            )
         uv = _pixels(row.numbers_or_nan(first_column + offsets), settings, column_size)
         _check_point(row, uv, column_size, header)
         for camera in cameras:
@@ -130,12 +134,6 @@ def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
         return dict(zip(cameras, fluoroscopes))
     known_names = settings.names.fluoroscopes
     return {camera: known_names.get(name, name) for camera, name in camera_names.items()}
-
-
-def _check_offsets(row: Row, first: int, offsets: int) -> None:
-    """Raise DataError for cameras with a time offset, which DLTdv allows."""
-    if offsets and any(Row(row.path, row.line, row.cells[first : first + offsets]).numbers()):
-        row.fail('the cameras are offset against each other in time: export them without offset')
 
 
 def _pixels(

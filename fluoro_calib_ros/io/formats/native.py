@@ -228,7 +228,7 @@ KNOWN_ORIENTATION = Format(
     'known_orientation',
     f'{TITLE} of fluoro_calib_ros',
     parts=('cameras',),
-    recognise=lambda sample: {'fluoroscopes', 'K'} <= {n.split(':')[0] for n in sample.lines},
+    recognise=lambda sample: {'fluoroscopes', 'K'} <= sample.keys,
     read=read,
     write=write,
 )

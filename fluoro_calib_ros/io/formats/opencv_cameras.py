@@ -29,7 +29,6 @@ from .content import (
     Content,
     FileSettings,
     Format,
-    Sample,
     Written,
     check_matrix,
     check_rotation,
@@ -42,13 +41,6 @@ from .content import (
 _OPENCV = '_opencv.yaml'
 MATRIX_NAMES = ('camera_matrix', 'Camera_Matrix', 'cameraMatrix', 'K')
 DISTORTION_NAMES = ('distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'D')
-
-
-def _is_opencv(sample: Sample) -> bool:
-    """Return whether the file begins like OpenCV's file storage and has a camera matrix."""
-    if not sample.first.startswith('%YAML'):
-        return False
-    return any(line.split(':')[0] in MATRIX_NAMES for line in sample.lines)
 
 
 def _read_opencv(path: Path, settings: FileSettings) -> Content:
@@ -144,7 +136,9 @@ OPENCV = Format(
     'opencv',
     'OpenCV YAML',
     parts=('cameras',),
-    recognise=_is_opencv,
+    recognise=lambda sample: (
+        sample.first.startswith('%YAML') and bool(sample.keys & set(MATRIX_NAMES))
+    ),
     read=_read_opencv,
     write=_write_opencv,
     says_units=False,
@@ -157,13 +151,6 @@ OPENCV = Format(
 # distortions (OpenCV), rotation (Rodrigues vector) and translation of X = R P + t, metadata.
 # Pixels are those of OpenCV. Lengths have the unit of the calibration board, which the file does
 # not state.
-
-
-def _is_anipose(sample: Sample) -> bool:
-    """Return whether the file is TOML with tables."""
-    if sample.suffix != '.toml':
-        return False
-    return any(line.startswith('[') for line in sample.lines)
 
 
 def _read_anipose(path: Path, settings: FileSettings) -> Content:
@@ -242,7 +229,9 @@ ANIPOSE = Format(
     'anipose',
     'Anipose calibration',
     parts=('cameras',),
-    recognise=_is_anipose,
+    recognise=lambda sample: (
+        sample.suffix == '.toml' and any(line.startswith('[') for line in sample.lines)
+    ),
     read=_read_anipose,
     write=_write_anipose,
     says_units=False,
@@ -257,14 +246,6 @@ ANIPOSE = Format(
 
 _CAMERA_INFO = '_camera_info.yaml'
 _MODELS = ('plumb_bob', 'rational_polynomial')
-
-
-def _is_camera_info(sample: Sample) -> bool:
-    """Return whether the file has the entries of camera_info, and not the first line of OpenCV."""
-    if sample.first.startswith('%YAML'):
-        return False
-    keys = {line.split(':')[0] for line in sample.lines}
-    return {'camera_matrix', 'image_width'} <= keys
 
 
 def _read_camera_info(path: Path, settings: FileSettings) -> Content:
@@ -341,7 +322,9 @@ CAMERA_INFO = Format(
     'camera_info',
     'ROS camera_info YAML',
     parts=('cameras',),
-    recognise=_is_camera_info,
+    recognise=lambda sample: (
+        not sample.first.startswith('%YAML') and {'camera_matrix', 'image_width'} <= sample.keys
+    ),
     read=_read_camera_info,
     write=_write_camera_info,
 )

@@ -101,7 +101,7 @@ def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     names = arrays['labels'].tolist()
     xyz = arrays['xyz']
     residual = arrays['residual']
-    mm = _unit(path, str(arrays['unit']), settings)
+    mm = settings.unit_stated(f'{path}: the unit of the points', str(arrays['unit']))
     names = names[: xyz.shape[1]]
     if len(set(names)) < xyz.shape[1]:
         raise DataError(f'{path}: {xyz.shape[1]} points, but {len(set(names))} different names')
@@ -128,7 +128,8 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
         raise DataError(
             f'{path}: {matrices.shape[1]} rotations, but {len(set(names))} different names'
         )
-    mm = _unit(path, str(arrays['rotation_unit'] or arrays['unit']), settings)
+    unit = str(arrays['rotation_unit'] or arrays['unit'])
+    mm = settings.unit_stated(f'{path}: the unit of the points', unit)
     rotation, translation, is_invalid = pose_parts(matrices)
     first_frame = int(arrays['first'])
     if is_invalid.any():
@@ -143,14 +144,6 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
         translation * mm,
         rate_hz=float(arrays['rotation_rate']),
     )
-
-
-def _unit(path: Path, unit: str, settings: FileSettings) -> float:
-    """Return the unit of a file in mm. Raises DataError for an unknown one."""
-    mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(unit)
-    if mm is None:
-        raise DataError(f'{path}: the unit of the points is {unit!r}, give it with --units')
-    return mm
 
 
 def _check_size(path: Path, content: bytes) -> None:
@@ -332,9 +325,7 @@ def _read_trc(path: Path, settings: FileSettings) -> Content:
     for name in ('DataRate', 'NumMarkers', 'Units'):
         if name not in header:
             raise DataError(f'{path}, row 2: the header has no {name}')
-    mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(header['Units'].lower())
-    if mm is None:
-        raise DataError(f'{path}, row 3: the unit is {header["Units"]!r}, give it with --units')
+    mm = settings.unit_stated(f'{path}, row 3: the unit', header['Units'].lower())
     (rate,) = Row(path, 3, [header['DataRate']]).numbers()
     names = [cell.strip() for cell in lines[3].split('\t')[2:] if cell.strip()]
     count = Row(path, 3, [header['NumMarkers']]).whole(0, 'NumMarkers')

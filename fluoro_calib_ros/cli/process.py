@@ -149,6 +149,7 @@ def _process(
 ) -> bool:
     """Run all steps in the working directory, write the table and print it. Raises DataError."""
     from ..io.calibration import rig_verdict
+    from ..io.csv_table import Table
     from ..processes import Programs
 
     with Programs() as programs:
@@ -170,7 +171,10 @@ def _process(
         trial_row(name, verdict, [(step, work.done.get(step.key)) for step in steps])
         for name, steps in trials.items()
     ]
-    path = study.folder / _write_table(study.out, rows)
+    columns = tuple(dict.fromkeys(key for row in rows for key in row))
+    table = Table(columns, ([row.get(column, '') for column in columns] for row in rows))
+    table.write(study.out / TABLE)
+    path = study.folder / study.out / TABLE
     verdicts = Counter(row['verdict'] for row in rows)
     counts = ', '.join(f'{count} {name}' for name, count in sorted(verdicts.items()))
     lines = [
@@ -454,13 +458,3 @@ def _doubts(row: Mapping[str, Any], findings: Iterable[Mapping[str, Any]]) -> di
         'verdict': 'fail' if is_wrong else 'cannot tell',
         'cause': '; '.join(finding['sentence'] for finding in doubtful),
     }
-
-
-def _write_table(out: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Write the table of all trials; return its path. Raises DataError."""
-    from ..io.csv_table import Table
-
-    columns = tuple(dict.fromkeys(key for row in rows for key in row))
-    path = out / TABLE
-    Table(columns, ([row.get(column, '') for column in columns] for row in rows)).write(path)
-    return path

@@ -201,7 +201,11 @@ def open_images(path: Path) -> ImageSource:
         images = read_cine_images(path, header)
         return ImageSource('video', len(header.offsets), images, header.frame_rate)
     if suffix in DICOM_SUFFIXES:
-        return _open_dicom(path)
+        dicom = read_dicom_header(path)
+        kind = 'stack' if dicom.frame_rate is None else 'video'
+        kind = 'image' if dicom.count == 1 else kind
+        rate = None if dicom.count == 1 else dicom.frame_rate
+        return ImageSource(kind, dicom.count, read_dicom_images(path, dicom), rate)
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(
             f'the suffix {suffix_of(path) or "(none)"} is not that of an image or a video '
@@ -213,15 +217,6 @@ def open_images(path: Path) -> ImageSource:
         check_name(path)
         return ImageSource('stack', pages, _read_pages(path, pages))
     return ImageSource('image', 1, _read_image(path))
-
-
-def _open_dicom(path: Path) -> ImageSource:
-    header = read_dicom_header(path)
-    images = read_dicom_images(path, header)
-    if header.count == 1:
-        return ImageSource('image', 1, images)
-    kind = 'stack' if header.frame_rate is None else 'video'
-    return ImageSource(kind, header.count, images, header.frame_rate)
 
 
 def check_name(path: Path) -> None:

@@ -253,20 +253,18 @@ class ImageFolder:
     path: Path
     #: images and videos, relative to the folder, sorted by name
     files: tuple[Path, ...]
+    written: tuple[Path, ...]  #: names of the output files for `files`
     passed_over: tuple[str, ...]  #: other files
     recursive: bool  #: whether subfolders are included
 
-    @property
-    def written(self) -> tuple[Path, ...]:
-        """Names of the output files for `files`."""
-        return tuple(self._written(path) for path in self.files)
 
-    def _written(self, path: Path) -> Path:
-        suffix = image_suffix_of(self.path / path)
-        new_suffix = _WRITTEN_AS.get(suffix, suffix)
-        if suffix_of(path) == suffix:
-            return path.with_suffix(new_suffix if suffix in _WRITTEN_AS else path.suffix)
-        return path.with_name(path.name + new_suffix)  # its format was recognised by content
+def _written_as(path: Path, folder: Path) -> Path:
+    """Return the name of the output for an image or video of a folder."""
+    suffix = image_suffix_of(folder / path)
+    new_suffix = _WRITTEN_AS.get(suffix, suffix)
+    if suffix_of(path) == suffix:
+        return path.with_suffix(new_suffix if suffix in _WRITTEN_AS else path.suffix)
+    return path.with_name(path.name + new_suffix)  # its format was recognised by content
 
 
 def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
@@ -274,7 +272,7 @@ def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
 
     Raises DataError if there are none, or if two would be written under the same name.
     """
-    paths = (path for path in folder.rglob('*')) if recursive else folder.iterdir()
+    paths = folder.rglob('*') if recursive else folder.iterdir()
     files = sorted(path.relative_to(folder) for path in paths if path.is_file())
     images = tuple(path for path in files if image_suffix_of(folder / path))
     if not images:
@@ -283,15 +281,15 @@ def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
             'videos'
         )
     other_files = tuple(str(path) for path in files if path not in set(images))
-    image_folder = ImageFolder(folder, images, other_files, recursive)
+    written = tuple(_written_as(path, folder) for path in images)
     by_name: dict[Path, Path] = {}
-    for path, name in zip(images, image_folder.written):
+    for path, name in zip(images, written):
         if name in by_name:
             raise DataError(
                 f'{folder}: {by_name[name]} and {path} would both be written as {name}, rename one'
             )
         by_name[name] = path
-    return image_folder
+    return ImageFolder(folder, images, written, other_files, recursive)
 
 
 @contextmanager

@@ -52,7 +52,7 @@ from .content import (
 from .tables import (
     Row,
     ascending_frames,
-    bodies_of,
+    at_all_frames,
     check_labels,
     frames_of,
     joined,
@@ -142,7 +142,7 @@ def _write_autoscoper(path: Path, content: Content, settings: FileSettings) -> W
     assert content.bodies is not None
     mm, notes = settings.unit_or('mm', str(path))
     frames = frames_of(path, [content.bodies], settings, needs_rate=False)
-    matrices = homogeneous(bodies_of(content.bodies, frames), mm)
+    matrices = homogeneous(at_all_frames(content.bodies, frames), mm)
     with atomic_file(path, 'w') as file:
         file.writelines(joined(frame_matrices.ravel()) + '\n' for frame_matrices in matrices)
     order = f'{path}: row 1 is frame {frames.first}, bodies are {", ".join(content.bodies.names)}'
@@ -214,7 +214,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write the orientations of bodies, and NAME_positions.sto next to it. Raises DataError."""
     assert content.bodies is not None
     frames = frames_of(path, [content.bodies], settings)
-    bodies = bodies_of(content.bodies, frames)
+    bodies = at_all_frames(content.bodies, frames)
     positions = path.with_name(f'{path.stem}_positions{path.suffix}')
     known = np.isfinite(bodies.rotation).all(axis=(2, 3))
     quaternions = np.full((*known.shape, 4), np.nan)

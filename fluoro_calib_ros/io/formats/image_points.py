@@ -270,7 +270,9 @@ def read_deeplabcut(path: Path, settings: FileSettings) -> Content:
     )
     targets = _body_parts(header, first_column)
     target_id, names = numbered_targets(targets, settings.names.targets)
-    fluoroscope = _fluoroscope_of_table(path, settings)
+    # The file is called <name>DLC_<network>.csv or CollectedData_<name>.csv.
+    name = path.stem.removeprefix('CollectedData_').split('DLC_')[0].rstrip('_') or path.stem
+    fluoroscope = settings.fluoroscope_of(name, path)
     size = settings.image_size_of(path, fluoroscope)
     frames: dict[int, Frame] = {}
     likelihood: list[NDArray[np.float64]] = []
@@ -331,12 +333,6 @@ def _body_parts(header: dict[str, Row], first: int) -> list[str]:
         if not name or parts.count(name) > 1:
             header['bodyparts'].fail(f'the body part {name!r} is given twice')
     return parts
-
-
-def _fluoroscope_of_table(path: Path, settings: FileSettings) -> str:
-    """Return the fluoroscope of a file <name>DLC_<network>.csv or CollectedData_<name>.csv."""
-    name = path.stem.removeprefix('CollectedData_').split('DLC_')[0].rstrip('_') or path.stem
-    return settings.fluoroscope_of(name, path)
 
 
 def _frame_number(row: Row, first: int) -> int:
@@ -411,7 +407,10 @@ def read_sleap(path: Path, settings: FileSettings) -> Content:
     score = score.reshape(len(uv), len(targets))
     score = np.where(np.isnan(score), 1.0, score)  # NaN: labelled by hand
     target_id, names = numbered_targets(targets, settings.names.targets)
-    fluoroscope = _fluoroscope_of_video(path, settings)
+    # The file is called <project>.000_<video>.analysis.h5.
+    name = path.name.removesuffix(path.suffix).removesuffix('.analysis')
+    match = _OF_VIDEO.fullmatch(name)
+    fluoroscope = settings.fluoroscope_of(match['video'] if match else name, path)
     size = settings.image_size_of(path, fluoroscope)
     placed = np.isfinite(uv).all(axis=2)
     seen = placed & (score > LEAST_SCORE) & (score < 1 / LEAST_SCORE)
@@ -443,13 +442,6 @@ def _nodes(path: Path, arrays: dict[str, np.ndarray]) -> list[str]:
     if len(set(nodes)) < len(nodes):
         raise DataError(f'{path}: two points have the same name')
     return nodes
-
-
-def _fluoroscope_of_video(path: Path, settings: FileSettings) -> str:
-    """Return the fluoroscope of a file <project>.000_<video>.analysis.h5: its video."""
-    name = path.name.removesuffix(path.suffix).removesuffix('.analysis')
-    match = _OF_VIDEO.fullmatch(name)
-    return settings.fluoroscope_of(match['video'] if match else name, path)
 
 
 def write_sleap(path: Path, content: Content, settings: FileSettings) -> Written:

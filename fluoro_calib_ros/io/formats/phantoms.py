@@ -79,7 +79,13 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
     if len(beads) > max_targets:
         raise DataError(f'{path}: phantoms of more than {max_targets} targets are not read')
     if layout is None:
-        layout = _of_numbers(rows)
+        names = _without_header(rows[0].cells)
+        if not names:
+            rows[0].fail(
+                f'{len(rows[0].cells)} columns without a header that names x, y and z; a bead is '
+                'x y z, id x y z or x y z name'
+            )
+        layout = _Layout({name: number for number, name in enumerate(names)})
     for row in beads:
         if len(row.cells) != len(rows[0].cells):
             row.fail(f'{len(row.cells)} columns, but the first row has {len(rows[0].cells)}')
@@ -133,17 +139,6 @@ def _without_header(cells: Sequence[str]) -> tuple[str, ...]:
     if len(cells) == 4 and all(numbers[:3]) and not numbers[3]:
         return 'x', 'y', 'z', 'id'
     return ()
-
-
-def _of_numbers(rows: Sequence[Row]) -> _Layout:
-    """Return the layout of rows without a header. Raises DataError for other columns."""
-    names = _without_header(rows[0].cells)
-    if not names:
-        rows[0].fail(
-            f'{len(rows[0].cells)} columns without a header that names x, y and z; a bead is '
-            'x y z, id x y z or x y z name'
-        )
-    return _Layout({name: number for number, name in enumerate(names)})
 
 
 def _unit(path: Path, layout: _Layout, settings: FileSettings) -> float:

@@ -53,14 +53,13 @@ from .reader_process import arrays_apart
 from .tables import (
     Row,
     ascending_frames,
-    bodies_of,
+    at_all_frames,
     check_labels,
     frames_of,
     joined,
     labels,
     number_text,
     numbered_targets,
-    points_of,
     read_frames,
     require_width,
     write_frames,
@@ -181,9 +180,9 @@ def write_c3d(path: Path, content: Content, settings: FileSettings) -> Written:
     file['data']['points'] = np.zeros((4, 0, frames.count))
     if content.points is not None:
         parameters['LABELS']['value'] = labels(content)
-        _add_points(file, points_of(content.points, frames), UNITS_MM[unit])
+        _add_points(file, at_all_frames(content.points, frames), UNITS_MM[unit])
     if content.bodies is not None:
-        matrices = homogeneous(bodies_of(content.bodies, frames), UNITS_MM[unit])
+        matrices = homogeneous(at_all_frames(content.bodies, frames), UNITS_MM[unit])
         file.add_parameter('ROTATION', 'LABELS', list(content.bodies.names))
         file.add_parameter('ROTATION', 'RATE', [frames.rate_hz])
         file.add_parameter('ROTATION', 'UNITS', [unit])
@@ -373,7 +372,7 @@ def _coordinates(row: Row, count: int) -> NDArray[np.float64]:
 def _write_trc(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write 3-D points. Raises DataError."""
     assert content.points is not None
-    points = points_of(content.points, frames_of(path, [content.points], settings))
+    points = at_all_frames(content.points, frames_of(path, [content.points], settings))
     unit = settings.units or 'mm'
     names = labels(content)
     check_labels(path, names, '\t')

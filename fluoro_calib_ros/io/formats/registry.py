@@ -98,7 +98,10 @@ def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Con
     recognised_format = recognised(path)
     format_ = recognised_format if kind is None else FORMATS[kind]
     if format_ is None:
-        raise DataError(f'{path}: the format is not known; {_beginning(path)}')
+        sample = sample_of(path)
+        nature = kind_not_read(sample.head) or ('' if sample.lines else 'not text')
+        beginning = f'it is {nature}' if nature else f'it begins with {quoted(sample.lines[0])}'
+        raise DataError(f'{path}: the format is not known; {beginning}')
     if format_.read is None:
         raise DataError(f'{path}: {format_.title} is only written, not read')
     try:
@@ -109,14 +112,6 @@ def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Con
         raise DataError(
             f'{error}; the file looks like {recognised_format.title} ({recognised_format.kind})'
         ) from None
-
-
-def _beginning(path: Path) -> str:
-    sample = sample_of(path)
-    kind = kind_not_read(sample.head)
-    if kind or not sample.lines:
-        return f'it is {kind or "not text"}'
-    return f'it begins with {quoted(sample.lines[0])}'
 
 
 def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Content:
@@ -153,14 +148,11 @@ def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Cont
             if name in observations:
                 raise DataError(f'{path}: another file is also of fluoroscope {name}')
             observations[name] = frames
-    names = {
-        name: i for _, content in contents.values() for name, i in content.names.targets.items()
-    }
     return Content(
         observations=observations or None,
         cameras=tuple(cameras),
         lookups=lookups,
-        names=Names(names),
+        names=Names(settings.names.targets),
         notes=notes,
     )
 

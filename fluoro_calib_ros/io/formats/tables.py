@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -308,27 +308,17 @@ def frames_of(
     return Frames(first_frame, count, float(rate))
 
 
-def points_of(points: Points, frames: Frames) -> Points:
-    """Expand points to all frames."""
-    return replace(
-        points,
-        frame=frames.numbers,
-        xyz_mm=frames.expanded(points.frame, points.xyz_mm),
-        sd_mm=frames.expanded(points.frame, points.sd_mm),
-        residual_px=frames.expanded(points.frame, points.residual_px),
-        rate_hz=frames.rate_hz,
-    )
+Part = TypeVar('Part', Points, Bodies)
 
 
-def bodies_of(bodies: Bodies, frames: Frames) -> Bodies:
-    """Expand bodies to all frames."""
-    return replace(
-        bodies,
-        frame=frames.numbers,
-        rotation=frames.expanded(bodies.frame, bodies.rotation),
-        translation_mm=frames.expanded(bodies.frame, bodies.translation_mm),
-        rate_hz=frames.rate_hz,
-    )
+def at_all_frames(part: Part, frames: Frames) -> Part:
+    """Expand points or bodies to all frames, NaN where there are none."""
+    values = {
+        name: frames.expanded(part.frame, value)
+        for name, value in vars(part).items()
+        if isinstance(value, np.ndarray) and name not in ('frame', 'target_id')
+    }
+    return replace(part, frame=frames.numbers, rate_hz=frames.rate_hz, **values)
 
 
 def rate_of(frame: NDArray[np.int64], stamp_ns: np.ndarray) -> float | None:

@@ -250,16 +250,32 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
 
 
 def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recording:
-    """Read or extract the observations. Raises DataError."""
+    """Read the observations, or extract them from images. Raises DataError."""
     from ..exposures.names import Names
-    from ..jobs.image_sources import contains_images
+    from ..jobs.extraction import recording_of_images
+    from ..jobs.image_sources import ImageAngles, contains_images
     from ..jobs.sources import read_source, with_decisions
 
-    if contains_images(arguments.source):
-        return with_decisions(_extracted(arguments, survey), arguments.decisions)
-    names = Names() if survey is None else survey.names
-    source = source_of(arguments, bag_selection(arguments), names=names)
-    return read_source(collect=arguments.collect, **source)
+    if not contains_images(arguments.source):
+        names = Names() if survey is None else survey.names
+        source = source_of(arguments, bag_selection(arguments), names=names)
+        return read_source(collect=arguments.collect, **source)
+    if survey is None:
+        raise DataError(
+            f'{arguments.source}: beads in images need a phantom file with fixed coordinates, '
+            'without a column exposure'
+        )
+    with ProgressBar('extract') as bar:
+        recording = recording_of_images(
+            arguments.source,
+            survey,
+            arguments.fluoroscopes,
+            arguments.principal_distance,
+            scheduler=cluster_of(arguments),
+            progress=bar,
+            angles=ImageAngles(angle_options(arguments)),
+        )
+    return with_decisions(recording, arguments.decisions)
 
 
 def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
@@ -304,25 +320,3 @@ def _report(directory: Path) -> str | None:
     except DataError as error:
         print_note(f'no report: {error}')
         return None
-
-
-def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recording:
-    """Return observations extracted from images. Raises DataError."""
-    from ..jobs.extraction import recording_of_images
-    from ..jobs.image_sources import ImageAngles
-
-    if survey is None:
-        raise DataError(
-            f'{arguments.source}: beads in images need a phantom file with fixed coordinates, '
-            'without a column exposure'
-        )
-    with ProgressBar('extract') as bar:
-        return recording_of_images(
-            arguments.source,
-            survey,
-            arguments.fluoroscopes,
-            arguments.principal_distance,
-            scheduler=cluster_of(arguments),
-            progress=bar,
-            angles=ImageAngles(angle_options(arguments)),
-        )

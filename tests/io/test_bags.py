@@ -155,7 +155,7 @@ def test_frames_round_trip_is_exact(tmp_path, options):
 
 def test_namespaces_topics_and_qos_profiles(tmp_path):
     with BagWriter(tmp_path / 'run') as writer:
-        writer.write_frame(frame('a'), namespace='/rig/')
+        writer.write_frame(frame('a'), topic='/rig/a/target_observations')
         writer.write_frame(frame('b'), topic='/other/b/target_observations')
         hello = typestore().types['std_msgs/msg/String']('hello')
         writer.write('/text', 'std_msgs/msg/String', hello, START, START - 5, qos='latched')
@@ -181,7 +181,7 @@ def test_namespaces_topics_and_qos_profiles(tmp_path):
         'a': '/rig/a/target_observations',
         'b': '/other/b/target_observations',
     }
-    assert observations_topic('a') == TOPIC and observations_topic('a', 'x/y') == '/x/y' + TOPIC
+    assert observations_topic('a') == TOPIC
 
 
 def test_messages_are_read_in_time_order(tmp_path):
@@ -683,8 +683,8 @@ def test_repeated_frame_is_reported(tmp_path):
 
 def test_two_topics_of_one_fluoroscope_are_reported(tmp_path):
     with BagWriter(tmp_path / 'run') as writer:
-        writer.write_frame(frame(), namespace='x')
-        writer.write_frame(frame(), namespace='y')
+        writer.write_frame(frame(), topic='/x/a/target_observations')
+        writer.write_frame(frame(), topic='/y/a/target_observations')
     said = message_of(read_frames, tmp_path / 'run')
     assert '/x/a/target_observations' in said and '/y/a/target_observations' in said
 

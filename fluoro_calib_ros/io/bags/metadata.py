@@ -288,13 +288,9 @@ def message_from_frame(frame: Frame) -> Any:
     )
 
 
-def observations_topic(fluoroscope: str, namespace: str = '') -> str:
-    """Return the absolute topic of the observations of a fluoroscope.
-
-    namespace: namespace of the rig, such as '/rig'.
-    """
-    parts = [*namespace.strip('/').split('/'), fluoroscope, TOPIC_NAME]
-    return '/' + '/'.join(parts).lstrip('/')
+def observations_topic(fluoroscope: str) -> str:
+    """Return the absolute topic of the observations of a fluoroscope."""
+    return f'/{fluoroscope}/{TOPIC_NAME}'
 
 
 def fluoroscope_of_topic(topic: str) -> str:

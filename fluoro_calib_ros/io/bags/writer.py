@@ -167,18 +167,14 @@ class BagWriter:
         self._total.add(received_ns)
 
     def write_frame(
-        self,
-        frame: Frame,
-        topic: str | None = None,
-        namespace: str = '',
-        log_time_ns: int | None = None,
+        self, frame: Frame, topic: str | None = None, log_time_ns: int | None = None
     ) -> None:
         """Write a Frame as TargetObservations.
 
-        topic: by default <namespace>/<fluoroscope>/target_observations. log_time_ns: by default
-        the stamp of the frame. Raises DataError.
+        topic: by default <fluoroscope>/target_observations. log_time_ns: by default the stamp of
+        the frame. Raises DataError.
         """
-        topic = topic or observations_topic(frame.fluoroscope, namespace)
+        topic = topic or observations_topic(frame.fluoroscope)
         time = frame.stamp_ns if log_time_ns is None else log_time_ns
         self.write(topic, TARGET_OBSERVATIONS, message_from_frame(frame), time)
 

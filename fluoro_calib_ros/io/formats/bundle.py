@@ -64,10 +64,12 @@ def read(path: Path, settings: FileSettings) -> Content:
     """Read the wanted parts from the file and those next to it. Raises DataError."""
     files = {ending: path.with_suffix(ending) for ending in WIDTHS}
     rows = {
-        ending: _rows(file, WIDTHS[ending])
+        ending: read_table(file, ' ')
         for ending, file in files.items()
         if file.exists() or file == path
     }
+    for ending, file_rows in rows.items():
+        require_width(file_rows, WIDTHS[ending], f'a {ending} file')
     stations = rows.get('.eop', [])
     cameras = _cameras(rows, settings)
     parts: dict[str, Any] = {}
@@ -82,12 +84,6 @@ def read(path: Path, settings: FileSettings) -> Content:
     if 'survey' in wanted and '.xyz' in rows:
         parts['survey'] = _survey(files['.xyz'], rows['.xyz'], settings.unit_read(files['.xyz']))
     return Content(**parts)
-
-
-def _rows(path: Path, width: int) -> list[Row]:
-    rows = read_table(path, ' ')
-    require_width(rows, width, f'a {path.suffix} file')
-    return rows
 
 
 def _cameras(rows: Mapping[str, Sequence[Row]], settings: FileSettings) -> _Cameras:

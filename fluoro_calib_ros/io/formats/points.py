@@ -22,7 +22,6 @@ import math
 import os
 import re
 import struct
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -339,21 +338,16 @@ def _read_trc(path: Path, settings: FileSettings) -> Content:
     ]
     if not rows:
         raise DataError(f'{path}: the file has no frames')
+    stated = header.get('NumFrames', str(len(rows)))
     target_id, content_names = numbered_targets(names, settings.names.targets)
     xyz_mm = from_units(np.array([_coordinates(row, count) for row in rows]), mm)
     return Content(
         points=points_without_precision(ascending_frames(rows, 1), target_id, xyz_mm, rate),
         names=content_names,
-        notes=_missing_frames(path, header, len(rows)),
+        notes=(f'{path}: the header states {stated} frames, the file has {len(rows)}',)
+        if Row(path, 3, [stated]).whole(0, 'NumFrames') != len(rows)
+        else (),
     )
-
-
-def _missing_frames(path: Path, header: Mapping[str, str], count: int) -> tuple[str, ...]:
-    """Return a note if a header states another number of frames than the file has."""
-    stated = header.get('NumFrames', str(count))
-    if Row(path, 3, [stated]).whole(0, 'NumFrames') == count:
-        return ()
-    return (f'{path}: the header states {stated} frames, the file has {count}',)
 
 
 def _coordinates(row: Row, count: int) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -313,7 +313,7 @@ Part = TypeVar('Part', Points, Bodies)
 
 def at_all_frames(part: Part, frames: Frames) -> Part:
     """Expand points or bodies to all frames, NaN where there are none."""
-    values = {
+    values: dict[str, Any] = {
         name: frames.expanded(part.frame, value)
         for name, value in vars(part).items()
         if isinstance(value, np.ndarray) and name not in ('frame', 'target_id')

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ..bodies.body import Body
     from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..exposures.angles import AngleOptions
-    from ..io.access import PathLike
     from ..io.formats.content import FileSettings
     from ..jobs.scheduling import Cluster
     from ..jobs.sources import BagSelection, Recording, Survey
@@ -200,13 +199,13 @@ def add_oriented_source(parser: argparse.ArgumentParser, options: type, **metava
 
 
 def read_oriented_source(
-    arguments: argparse.Namespace, path: PathLike
+    arguments: argparse.Namespace,
 ) -> tuple[Recording, dict[str, FluoroscopeCalibration], RigOrientation]:
-    """Read a recording, its calibrations, and the orientation of the rig from path.
+    """Read a recording, its calibrations, and the orientation of the rig.
 
     Raises DataError, also if the orientation belongs to other calibrations.
     """
-    from ..io.calibration import load_orientation
+    from ..io.calibration import load_orientation, orientation_path
     from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrated_source
 
@@ -216,6 +215,7 @@ def read_oriented_source(
         validate=False,
         **source_of(arguments, bag_selection(arguments, pairing=False)),
     )
+    path = arguments.orientation or orientation_path(arguments.calibration)
     orientation = load_orientation(path)
     names = [name for name in orientation.fluoroscopes if name in recording.frames]
     with ErrorsAt(path):

@@ -106,7 +106,6 @@ def run(arguments: argparse.Namespace) -> bool:
     Returns whether the bodies are those of the recording, as far as the findings say.
     """
     from ..io.bodies import read_bodies, read_joints
-    from ..io.calibration import orientation_path
     from ..io.folder import check_output_folder
     from ..io.versions import write_learned_shapes
     from ..jobs.bodies import (
@@ -119,11 +118,10 @@ def run(arguments: argparse.Namespace) -> bool:
     )
     from ..jobs.learning import learn_shapes
 
-    path = arguments.orientation or orientation_path(arguments.calibration)
     check_output_folder(arguments.out, BODIES_FOLDER, input_paths(arguments))
     bodies = read_bodies(arguments.bodies)
     joints = read_joints(arguments.joints, bodies) if arguments.joints else ()
-    recording, calibrations, orientation = read_oriented_source(arguments, path)
+    recording, calibrations, orientation = read_oriented_source(arguments)
     print_notes(recording.notes)
     if has_times(recording.frames) == (arguments.rate is not None):
         raise DataError(f'{arguments.source}: {NO_TIMES if arguments.rate is None else TIMES}')
@@ -132,7 +130,7 @@ def run(arguments: argparse.Namespace) -> bool:
         if not joints:
             raise DataError('--neutral: there are no joints, give --joints')
         neutral_arguments = argparse.Namespace(**{**vars(arguments), 'source': arguments.neutral})
-        neutral = read_oriented_source(neutral_arguments, path)[0].frames
+        neutral = read_oriented_source(neutral_arguments)[0].frames
     options = options_of(
         BodiesOptions,
         arguments,

@@ -145,6 +145,7 @@ def _correct_points(arguments: argparse.Namespace, calibrations: Calibrations) -
 
 def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -> None:
     """Correct images and videos. Raises DataError."""
+    from ..io.image_reading import read_image_angles
     from ..jobs.image_correction import ImageCorrectionRequest, run_image_correction
 
     source = arguments.source
@@ -156,7 +157,12 @@ def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -
             f'{", ".join(calibrations)}: choose one with --fluoroscope'
         )
     (calibration,) = calibrations.values()
-    angles = _angles_of_images(arguments, calibration)
+    angles = None
+    if arguments.angles is not None and calibration.angle_field is None:
+        name = calibration.calibration_id
+        print_note(f'{arguments.angles}: not used, {name} does not depend on an angle')
+    elif arguments.angles is not None:
+        angles = read_image_angles(arguments.angles)
     if angles is None:
         if calibration.angle_field is not None and arguments.angle_deg is None:
             print_note(
@@ -223,18 +229,3 @@ def _print_images(
         f'{done.images} {noun} of {size} px corrected with {calibration.calibration_id}, written '
         f'to {arguments.out}; {empty} pixels of each are empty, the original does not show them',
     )
-
-
-def _angles_of_images(
-    arguments: argparse.Namespace, calibration: FluoroscopeCalibration
-) -> dict[int, float] | None:
-    """Return the angles [rad] of images by number, None without --angles. Raises DataError."""
-    from ..io.image_reading import read_image_angles
-
-    if arguments.angles is None:
-        return None
-    if calibration.angle_field is None:
-        name = calibration.calibration_id
-        print_note(f'{arguments.angles}: not used, {name} does not depend on an angle')
-        return None
-    return read_image_angles(arguments.angles)

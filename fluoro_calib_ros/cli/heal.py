@@ -54,7 +54,6 @@ def run(arguments: argparse.Namespace) -> bool:
     """Heal a rig; return whether the verdict is pass. Raises DataError."""
     from ..errors import ErrorsAt
     from ..io.bodies import read_bodies
-    from ..io.calibration import orientation_path
     from ..io.folder import check_output_folder
     from ..jobs.healing import (
         HEALING_FOLDER,
@@ -65,10 +64,9 @@ def run(arguments: argparse.Namespace) -> bool:
     )
     from ..jobs.learning import learned_for
 
-    path = arguments.orientation or orientation_path(arguments.calibration)
     check_output_folder(arguments.out, HEALING_FOLDER, input_paths(arguments))
     bodies = read_bodies(arguments.bodies) if arguments.bodies else ()
-    recording, calibrations, orientation = read_oriented_source(arguments, path)
+    recording, calibrations, orientation = read_oriented_source(arguments)
     learned = None if bodies else learned_for(arguments.calibration, orientation)
     print_notes(recording.notes)
     options = options_of(HealingOptions, arguments)

@@ -80,16 +80,14 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.access import write_bytes
     from ..io.bags.mcap_file import is_bag
     from ..io.bodies import write_reconstruction
-    from ..io.calibration import orientation_path
     from ..io.folder import check_output_file
     from ..jobs.reconstruction import ReconstructionOptions, reconstruct
 
-    path = arguments.orientation or orientation_path(arguments.calibration)
     inputs = input_paths(arguments)
     check_output_file(arguments.out, inputs)
     if arguments.figure is not None:
         check_output_file(arguments.figure, [*inputs, arguments.out])
-    recording, calibrations, orientation = read_oriented_source(arguments, path)
+    recording, calibrations, orientation = read_oriented_source(arguments)
     print_notes(recording.notes)
     frames = recording.frames
     options = options_of(

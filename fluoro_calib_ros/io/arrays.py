@@ -166,23 +166,18 @@ def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndar
     stream = io.BytesIO(content)
     try:
         array = np.lib.format.read_array(stream, allow_pickle=False)
+        if array.dtype.kind not in 'biufU' or not array.itemsize or stream.tell() < len(content):
+            raise ValueError
+        if array.dtype.kind == 'U':
+            codes = np.frombuffer(array.tobytes(), f'{array.dtype.str[0]}u4')
+            is_surrogate = (codes >> 11) == 0xD800 >> 11
+            if ((codes > sys.maxunicode) | is_surrogate).any():  # not valid characters
+                raise ValueError
     except Exception:  # numpy evaluates the header as Python, which raises almost anything
-        raise _no_plain_array(path, name) from None
-    is_plain = array.dtype.kind in 'biufU' and array.dtype.itemsize
-    if not is_plain or stream.tell() < len(content):
-        raise _no_plain_array(path, name)
-    if array.dtype.kind == 'U':
-        codes = np.frombuffer(array.tobytes(), f'{array.dtype.str[0]}u4')
-        is_surrogate = (codes >> 11) == 0xD800 >> 11
-        if ((codes > sys.maxunicode) | is_surrogate).any():  # not valid characters
-            raise _no_plain_array(path, name)
+        raise DataError(
+            f'{path}: the array {name} does not contain plain numbers or text, only these are read'
+        ) from None
     return array.astype(array.dtype.newbyteorder('='))  # a writable copy
-
-
-def _no_plain_array(path: PathLike, name: str) -> DataError:
-    return DataError(
-        f'{path}: the array {name} does not contain plain numbers or text, only these are read'
-    )
 
 
 def _validate(where: object, array: np.ndarray, spec: Field) -> None:

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +80,14 @@ def read_bodies(path: PathLike) -> tuple[Body, ...]:
             if not name:
                 block.fail(index, 'the body has no name')
             if marker in first_rows:
-                _fail_repeated(block, index, name, *first_rows[marker])
+                row, owner = first_rows[marker]
+                cause = f'marker {marker} of {name} is already given in row {row}'
+                if name != owner:
+                    cause = (
+                        f'marker {marker} is one of {owner} in row {row} and one of {name} here; '
+                        'a marker belongs to one body'
+                    )
+                block.fail(index, cause)
             first_rows[marker] = int(block.lines[index]), name
             rows.setdefault(name, []).append((marker, values))
         if len(first_rows) > max_markers:
@@ -108,17 +115,6 @@ def _numbers(block: Block) -> NDArray[np.float64]:
         block.require(name, np.isfinite(values) == known, 'but x, y and z are known together')
     block.require('sd', ~(sd < 0), 'below 0')
     return np.column_stack([x, y, z, np.where(np.isfinite(sd), sd, np.inf)])
-
-
-def _fail_repeated(block: Block, index: int, name: str, row: int, owner: str) -> NoReturn:
-    marker = block.strings('marker')[index]
-    if name == owner:
-        block.fail(index, f'marker {marker} of {name} is already given in row {row}')
-    block.fail(
-        index,
-        f'marker {marker} is one of {owner} in row {row} and one of {name} here; a marker belongs '
-        'to one body',
-    )
 
 
 def write_bodies(path: PathLike, bodies: Sequence[Body]) -> None:

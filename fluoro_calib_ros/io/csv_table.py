@@ -139,8 +139,12 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
     while block := list(islice(rows, BLOCK)):
         is_empty = False
         lines, cells = zip(*block)
-        _check_widths(path, header, cells, lines)
-        yield Block(path, header, list(cells), np.array(lines))
+        read_block = Block(path, header, list(cells), np.array(lines))
+        if set(map(len, cells)) != {len(header)}:
+            index = next(i for i, row in enumerate(cells) if len(row) != len(header))
+            width = len(cells[index])
+            read_block.fail(index, f'{width} columns, but the header has {len(header)}')
+        yield read_block
     if is_empty:
         raise DataError(f'{path}: the file has a header, but no rows')
 
@@ -310,18 +314,6 @@ def _check_header(where: str, header: Sequence[str], required: Sequence[str]) ->
     for name in header:
         if name and header.count(name) > 1:
             raise DataError(f'{where}: the header has the column {name} twice')
-
-
-def _check_widths(
-    path: PathLike, header: Sequence[str], rows: Sequence[Sequence[str]], lines: Sequence[int]
-) -> None:
-    """Raise DataError for the first row with too few or too many cells."""
-    if set(map(len, rows)) != {len(header)}:
-        index = next(i for i, row in enumerate(rows) if len(row) != len(header))
-        raise DataError(
-            f'{path}, row {lines[index]}: {len(rows[index])} columns, '
-            f'but the header has {len(header)}'
-        )
 
 
 def is_number(cell: str, kind: Callable[[str], Any] = float) -> bool:

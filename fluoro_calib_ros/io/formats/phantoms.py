@@ -228,7 +228,11 @@ def content_of(path: Path, text: str, settings: FileSettings) -> Content:
     if not beads:
         raise DataError(f'{path}: the file has a header, but no beads')
     mm, notes = settings.unit_or('cm', str(path))
-    xyz = from_units(np.array([_bead(row) for row in beads]) * scale, mm)
+    for row in beads:
+        if not 3 <= len(row.cells) <= 4:
+            row.fail(f'{len(row.cells)} columns, but a bead has x,y,z and perhaps a name')
+    xyz = np.array([Row(row.path, row.line, row.cells[:3]).numbers() for row in beads])
+    xyz = from_units(xyz * scale, mm)
     bead_names = [row.cells[3] if len(row.cells) > 3 else '' for row in beads]
     if any(bead_names) and not all(bead_names):
         index = bead_names.index('')
@@ -261,12 +265,6 @@ def _factors(row: Row) -> NDArray[np.float64]:
     if len(cells) < 3 or not all(cell.lower().startswith('s') for cell in cells[:3]):
         return np.ones(3)
     return np.array(Row(row.path, row.line, [cell[1:] for cell in cells[:3]]).numbers())
-
-
-def _bead(row: Row) -> list[float]:
-    if not 3 <= len(row.cells) <= 4:
-        row.fail(f'{len(row.cells)} columns, but a bead has x,y,z and perhaps a name')
-    return Row(row.path, row.line, row.cells[:3]).numbers()
 
 
 def _write_framespec(path: Path, content: Content, settings: FileSettings) -> Written:

@@ -85,7 +85,6 @@ def test_body_is_followed_from_its_first_pose_although_its_speed_is_unknown(seed
         assert np.abs(error).max() < 0.5
 
 
-
 def test_one_image_point_a_view_is_never_believed_to_give_the_pose():
     """Two markers, each in one view for 80 ms: live errors stay below 4.5 standard deviations."""
 

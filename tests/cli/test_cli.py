@@ -19,7 +19,8 @@ import pytest
 from rigs import run
 from scipy.spatial.distance import pdist
 
-from fluoro_calib_ros.cli import COMMANDS, main
+from fluoro_calib_ros.cli import COMMANDS, main, make_parser
+from fluoro_calib_ros.cli.arguments import input_paths
 from fluoro_calib_ros.correction.base import CorrectionStatus
 from fluoro_calib_ros.io.calibration import load_calibration
 from fluoro_calib_ros.jobs.simulation import write_bag
@@ -770,3 +771,29 @@ def test_angles_of_images_are_not_ignored_for_image_points(result, tmp_path, cap
     assert run(*words, '--angles', tmp_path / 'angles.csv') == 1
     assert 'a column angle_deg' in capsys.readouterr().err
     assert not (tmp_path / 'corrected.csv').exists()
+
+
+@pytest.mark.parametrize('command', ['adjust', 'orient', 'bodies', 'heal'])
+def test_decisions_are_inputs_of_every_command(command):
+    """No command overwrites a file that it has read, whichever option names it."""
+    words = [command, 'source', '--calibration', 'c', '--decisions', 'doubtful.csv']
+    words += {
+        'adjust': ['--phantom', 'p.csv', '--out', 'out'],
+        'orient': ['--phantom', 'p.csv'],
+        'bodies': ['--bodies', 'b.csv', '--joints', 'j.toml', '--neutral', 'n', '--out', 'out'],
+        'heal': ['--orientation', 'o.npz', '--out', 'out'],
+    }[command]
+    found = {str(path) for path in input_paths(make_parser(command).parse_args(words))}
+    given = {word for word in words[1:] if not word.startswith('--')}
+    assert found == given - {'out'}
+
+
+def test_adjust_does_not_overwrite_its_decisions(rig, result, tmp_path, capsys):
+    """The table of doubtful points of an earlier adjustment is a part of its folder."""
+    out = tmp_path / 'out'
+    words = ('adjust', rig / 'test', '--phantom', rig / 'phantom.csv', '--calibration', result)
+    assert run(*words, '--out', out, '--exit-zero') == 0
+    (out / 'doubtful.csv').write_text('fluoroscope,exposure,target_id,decision\n')
+    decided = (*words, '--decisions', out / 'doubtful.csv')
+    assert run(*decided, '--out', out) == 1
+    assert 'would be overwritten' in capsys.readouterr().err

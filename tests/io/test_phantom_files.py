@@ -204,3 +204,15 @@ def test_beads_of_neighbouring_layers_do_not_overlap(hexagonal):
     with rigs.refused(Kind.IMPLAUSIBLE_NUMBER):
         Drawing(3, 3, 2, pitch_mm=pitch, hexagonal=hexagonal, diameter_mm=5.0)
     Drawing(3, 3, pitch_mm=pitch, hexagonal=hexagonal, diameter_mm=5.0)
+
+
+@pytest.mark.parametrize(('count', 'looks_like'), [(5, 'MayaCam'), (11, 'DLT')])
+def test_beads_that_look_like_a_camera_need_a_header(tmp_path, count, looks_like):
+    """Rows of three numbers may be either; the sentence says what to do."""
+    path = tmp_path / 'beads.csv'
+    rows = [f'{i}.5,{i * i},{7 * i % 5}' for i in range(count)]
+    path.write_text('\n'.join(rows) + '\n')
+    with pytest.raises(DataError, match=f'{looks_like}.*a header, such as x,y,z'):
+        read_survey(path, FileSettings(units='mm'))
+    path.write_text('\n'.join(['x,y,z', *rows]) + '\n')
+    assert len(read_survey(path, FileSettings(units='mm')).phantom.target_id) == count

@@ -83,7 +83,6 @@ class FileSalvage:
         self.path = path
         self.topics: dict[str, ChannelInfo] = {}
         self.damages: list[Damage] = []
-        self.counts: Counter[str] = Counter()
         self.expected: Counter[str] = Counter()  # if the end of the file is intact
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -168,7 +167,6 @@ class FileSalvage:
                 return
             self._close_damage(received)
             self._last_ns = received
-            self.counts[topic] += 1
             yield SalvagedMessage(topic, received, sent, content[_MESSAGE.size :])
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._define(opcode, content)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from ..errors import ErrorsAt
 from .arguments import (
@@ -298,9 +298,7 @@ def _run_markers(arguments: argparse.Namespace) -> None:
             f'{doubtful_path}: decide on the doubtful ids in this file, and pass it with '
             '--decisions'
         )
-    print_result(
-        arguments, _marker_document(arguments.out, outcome), _marker_text(arguments.out, outcome)
-    )
+    _print_markers(arguments, outcome)
 
 
 def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
@@ -357,10 +355,10 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     )
 
 
-def _marker_document(out: Path, outcome: MarkerOutcome) -> dict[str, Any]:
-    """Return the summary for --json."""
-    return {
-        'out': str(out),
+def _print_markers(arguments: argparse.Namespace, outcome: MarkerOutcome) -> None:
+    """Print the summary of markers in motion."""
+    document = {
+        'out': str(arguments.out),
         'fluoroscopes': {
             name: {
                 'images': len(results),
@@ -386,10 +384,6 @@ def _marker_document(out: Path, outcome: MarkerOutcome) -> dict[str, Any]:
         'doubtful_ids': [vars(span) for span in outcome.spans()],
         'decisions': [vars(decision) for decision in outcome.decisions],
     }
-
-
-def _marker_text(out: Path, outcome: MarkerOutcome) -> str:
-    """Return the summary as text."""
     lines = []
     for name, results in outcome.results.items():
         measured = sum(len(r.markers.target_id) for r in results)
@@ -402,4 +396,5 @@ def _marker_text(out: Path, outcome: MarkerOutcome) -> str:
     exchanged = [d for d in outcome.decisions if d.kind == 'exchanged']
     if exchanged:
         lines.append(f'{len(exchanged)} exchanged pairs of ids were restored')
-    return '\n'.join([*lines, f'written to {out}'])
+    lines.append(f'written to {arguments.out}')
+    print_result(arguments, document, '\n'.join(lines))

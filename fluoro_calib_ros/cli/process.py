@@ -18,7 +18,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -350,16 +350,15 @@ class _Work:
         from ..io.documents import read_json, write_json
 
         step = started.step
-        status = int(started.process.returncode)
-        ok = status in (0, NOT_PASSED)
-        document = read_json(step.document) if ok else {}
-        message = '' if ok else _last_line(step.out.parent / LOG)
-        self.done[step.key] = done = Done(status, document, message)
-        if ok:
-            self._state[step.key] = {'digest': started.digest, 'status': status}
+        done = Done(int(started.process.returncode), {})
+        if done.ok:
+            done = replace(done, document=read_json(step.document))
+            self._state[step.key] = {'digest': started.digest, 'status': done.status}
         else:
+            done = replace(done, message=_last_line(step.out.parent / LOG))
             self._state.pop(step.key, None)
-            print_status(f'{step.key}: {message}')
+            print_status(f'{step.key}: {done.message}')
+        self.done[step.key] = done
         write_json(self._out / STATE, self._state)
         return done
 

@@ -154,14 +154,10 @@ def temporary_folder(path: PathLike) -> Iterator[Path]:
     Folders left behind by killed runs are deleted, too. Raises DataError that names the path if
     the folder cannot be created, and for an OSError in the block.
     """
-    target = os.path.abspath(path)
-    folder = _hidden(target, 'tmp')
-    with os_errors(path, 'cannot be written'):
-        for leftover in _leftovers(os.path.dirname(target), target):
-            if leftover.endswith('.tmp') and not _is_locked(leftover):
-                shutil.rmtree(leftover)
-        with _locked_folder(folder):
-            yield Path(folder)
+    clean_up(path)
+    folder = _hidden(os.path.abspath(path), 'tmp')
+    with os_errors(path, 'cannot be written'), _locked_folder(folder):
+        yield Path(folder)
 
 
 def clean_up(path: PathLike) -> None:

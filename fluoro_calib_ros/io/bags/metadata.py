@@ -54,10 +54,15 @@ def known_definition(msg_type: str) -> Definition:
 
 
 @cache
-def typestore() -> Typestore:
-    """Return the rosbags typestore of Jazzy with the messages of fluoro_calib_msgs."""
+def typestore(changes: int | None = None) -> Typestore:
+    """Return the rosbags typestore of Jazzy with the messages of fluoro_calib_msgs.
+
+    changes: types in ADDED are those after the first `changes` changes; by default the present.
+    """
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _package_texts().items():
+        if changes is not None and changes < len(ADDED.get(name, ())):
+            text = earlier_text(name, changes)
         store.register(get_types_from_msg(text, name))
     return store
 
@@ -115,7 +120,7 @@ def from_cdr(data: bytes, msg_type: str) -> Any:
         last_error = error
     for changes in reversed(range(len(ADDED.get(msg_type, ())))):
         try:
-            earlier_message = _read_cdr(_earlier_typestore(changes), data, msg_type)
+            earlier_message = _read_cdr(typestore(changes), data, msg_type)
         except DataError as error:
             last_error = error
             continue
@@ -143,17 +148,6 @@ def earlier_text(msg_type: str, changes: int = 0) -> str:
 def _added(msg_type: str, changes: int) -> list[str]:
     """Return the fields of a type that were added after the first `changes` changes."""
     return [name for names in ADDED[msg_type][changes:] for name in names]
-
-
-@cache
-def _earlier_typestore(changes: int) -> Typestore:
-    """Return the typestore with the types in ADDED after the first `changes` changes."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in _package_texts().items():
-        is_earlier = name in ADDED and changes < len(ADDED[name])
-        text = earlier_text(name, changes) if is_earlier else text
-        store.register(get_types_from_msg(text, name))
-    return store
 
 
 def _read_cdr(store: Typestore, data: bytes, msg_type: str) -> Any:
@@ -364,16 +358,13 @@ def parse_profiles(value: Any) -> list[dict[str, Any]]:
         return []
     if not isinstance(items, list):
         return []
-    return [_with_policy_names(item) for item in items if isinstance(item, dict)]
-
-
-def _with_policy_names(item: dict[str, Any]) -> dict[str, Any]:
-    item = dict(item)
-    for policy, names in _POLICY_NAMES.items():
-        number = item.get(policy)
-        if isinstance(number, int):
-            item[policy] = names[number] if 0 <= number < len(names) else 'unknown'
-    return item
+    profiles = [dict(item) for item in items if isinstance(item, dict)]
+    for item in profiles:
+        for policy, names in _POLICY_NAMES.items():
+            number = item.get(policy)
+            if isinstance(number, int):
+                item[policy] = names[number] if 0 <= number < len(names) else 'unknown'
+    return profiles
 
 
 class _Dumper(yaml.SafeDumper):

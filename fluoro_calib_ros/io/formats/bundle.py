@@ -154,8 +154,9 @@ def _frame(rows: Sequence[Row], name: str, exposure: int, size: tuple[int, int])
         rows[int(np.argmin(on_image))].fail(
             f'the point is outside the image of {size[0]} x {size[1]} px; y is negative downwards'
         )
-    if not (values[:, 2:4] > 0).all():
-        rows[int(np.argmin((values[:, 2:4] > 0).all(axis=1)))].fail('the noise is not above 0')
+    is_positive = (values[:, 2:4] > 0).all(axis=1)
+    if not is_positive.all():
+        rows[int(np.argmin(is_positive))].fail('the noise is not above 0')
     repeated = first_repeated(ids)
     if repeated is not None:
         rows[repeated[1]].fail(

@@ -173,14 +173,7 @@ def write_xmalab(path: Path, content: Content, settings: FileSettings) -> Writte
     target_names = content.names.target_names()
     frames = {name: {f.number: f for f in observations[name]} for name in cameras}
     numbers = sorted({number for view_frames in frames.values() for number in view_frames})
-    ids = sorted(
-        {
-            int(i)
-            for view_frames in frames.values()
-            for f in view_frames.values()
-            for i in f.target_id
-        }
-    )
+    ids = _ids([f for view_frames in frames.values() for f in view_frames.values()])
     labels = [target_names.get(i, default_name(i)) for i in ids]
     shift = int(numbers[0] == 0)
     check_row_count(path, numbers[-1], shift)
@@ -209,6 +202,11 @@ def write_xmalab(path: Path, content: Content, settings: FileSettings) -> Writte
     if shift:
         notes.append('exposure 0 is row 1, exposure 1 is row 2 and so on')
     return Written((str(path),), tuple(notes))
+
+
+def _ids(frames: Sequence[Frame]) -> list[int]:
+    """Return the ids of all targets, ascending."""
+    return sorted({int(i) for frame in frames for i in frame.target_id})
 
 
 def _file_pixels(frame: Frame, settings: FileSettings) -> NDArray[np.float64]:
@@ -353,7 +351,7 @@ def write_deeplabcut(path: Path, content: Content, settings: FileSettings) -> Wr
 
 
 def _write_camera(path: Path, frames: Sequence[Frame], named: dict[int, str]) -> None:
-    ids = sorted({int(i) for frame in frames for i in frame.target_id})
+    ids = _ids(frames)
     names = [as_text(named.get(i, default_name(i))) for i in ids]
     with atomic_file(path, 'w') as file:
         writer = csv.writer(file, lineterminator='\n')
@@ -459,7 +457,7 @@ def _content_of(frames: Sequence[Frame], named: dict[int, str]) -> bytes:
     """Return an analysis file of one track, axes in the order of SLEAP, with scores of 1."""
     import h5py
 
-    ids = sorted({int(i) for frame in frames for i in frame.target_id})
+    ids = _ids(frames)
     count = 1 + max(frame.number for frame in frames)
     uv = np.full((1, 2, len(ids), count), np.nan)
     for frame in frames:

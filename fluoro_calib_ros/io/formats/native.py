@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.names import Names, without_trivial
+from ...exposures.phantom import first_repeated
 from ...photogrammetry.rig_orientation import KnownOrientation
 from ..access import PathLike, read_text, write_text
 from ..bodies import NAME_COLUMN
@@ -91,8 +92,9 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
     frames, row = np.unique(frame, return_inverse=True)
     targets, column = np.unique(target, return_inverse=True)
     cell = row * len(targets) + column
-    if len(np.unique(cell)) < len(cell):
-        index = np.setdiff1d(np.arange(len(cell)), np.unique(cell, return_index=True)[1])[0]
+    repeated = first_repeated(cell)
+    if repeated is not None:
+        index = repeated[1]
         rows.fail(index, f'target {target[index]} of frame {frame[index]} is given twice')
     shape = (len(frames), len(targets))
 

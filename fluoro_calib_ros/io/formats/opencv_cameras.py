@@ -12,6 +12,7 @@ are at integers from (0, 0), v downwards. The file does not state the unit of T.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,33 +66,27 @@ def _opencv_camera(path: Path, storage: cv2.FileStorage, settings: FileSettings)
         raise DataError(f'{path}: there is no camera_matrix of 3 x 3 numbers')
     check_matrix(path, matrix)
     distortion = _node_matrix(path, storage, DISTORTION_NAMES)
-    coefficients: tuple[float, ...] = ()
-    if distortion is not None and distortion.any():
-        coefficients = tuple(distortion.ravel().tolist())
+    if distortion is None or not distortion.any():
+        distortion = np.zeros(0)
+    coefficients = tuple(distortion.ravel().tolist())
     width = storage.getNode('image_width')
     height = storage.getNode('image_height')
     name = name_of_file(path, _OPENCV)
     size = settings.size_of(name)
     if not width.empty() and not height.empty():
         size = (int(width.real()), int(height.real()))
+    camera = Camera(name, matrix, size, distortion=coefficients)
     rotation = _node_matrix(path, storage, ('R',))
     translation = _node_matrix(path, storage, ('T', 't'))
     if rotation is None or translation is None:
-        return Camera(name, matrix, size, distortion=coefficients)
+        return camera
     if rotation.shape != (3, 3):
         rotation, _ = cv2.Rodrigues(rotation)
     check_rotation(path, rotation)
     if translation.size != 3:
         raise DataError(f'{path}: T has {translation.size} numbers, not 3')
-    mm = settings.unit_read(path)
-    return Camera(
-        name,
-        matrix,
-        image_size=size,
-        rotation=rotation,
-        translation_mm=from_units(translation.ravel(), mm),
-        distortion=coefficients,
-    )
+    translation_mm = from_units(translation.ravel(), settings.unit_read(path))
+    return replace(camera, rotation=rotation, translation_mm=translation_mm)
 
 
 def _node_matrix(

@@ -170,7 +170,10 @@ def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
         raise DataError(f'{path}: {len(rows)} rows, but MayaCam 1.0 has 5')
     require_width(rows, 3, 'MayaCam 1.0')
     position, angles, _, (u0, v0, z), (_, width, height) = (row.numbers() for row in rows)
-    size = (_pixels(rows[4], width), _pixels(rows[4], height))
+    for value in (width, height):
+        if value < 0 or value != int(value):
+            rows[4].fail(f'{value:g} px is not a side of an image')
+    size = (int(width) or 1024, int(height) or 1024)
     if not z:
         rows[3].fail('the principal distance is 0')
     # Columns: axes x, y, z of the camera in the world; extrinsic rotations about x, y and z.
@@ -184,12 +187,6 @@ def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
         from_units(np.array(position), settings.unit_read(path)),
     )
     return Content(cameras=(camera,))
-
-
-def _pixels(row: Row, value: float) -> int:
-    if value < 0 or value != int(value):
-        row.fail(f'{value:g} px is not a side of an image')
-    return int(value) or 1024
 
 
 MAYACAM1 = Format(

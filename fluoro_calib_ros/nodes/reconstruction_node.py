@@ -345,7 +345,7 @@ class ReconstructionNode(StreamNode):
         rig = self._rigs.newest
         misses, timing = (None, None)
         if rig is not None:
-            misses, timing = self._recent.faults(rig.orientation, rig.scatter.factor)
+            misses, timing = self._recent.faults(rig.orientation, rig.is_doubtful)
         state = ReconstructionState(
             node=self,
             topics=tuple(f'{name}/{VIEWS}' for name in self._names),

@@ -20,6 +20,7 @@ from ..bodies.tracking import BodyTracker, JointTracker, TrackedExposure, poses_
 from ..checks.rig_watch import RigDriftWatch
 from ..errors import DataError, ErrorsAt
 from ..exposures.stamps import Order, StampOrder
+from ..findings import Severity
 from ..io.bodies import JointEntry, read_bodies, read_joints
 from ..io.calibration import load_orientation, orientation_path
 from ..io.versions import calibrated_orientation
@@ -50,6 +51,12 @@ class Rig(NamedTuple):
     intersector: Intersector
     scatter: ObservedScatter
     watch: RigDriftWatch | None
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether rays miss each other by more than expected, or the drift watch has an alarm."""
+        has_drifted = self.watch is not None and self.watch.state.level > Severity.NOTE
+        return has_drifted or self.scatter.factor > 1
 
     def widened(self) -> tuple[Intersector, float]:
         """Return the intersector and the increase of sigma [px], widened after a drift alarm."""

@@ -110,14 +110,15 @@ class RecentExposures(Generic[AnyFrame]):
         self._misses.add(points)
 
     def faults(
-        self, orientation: RigOrientation, widening: float
+        self, orientation: RigOrientation, is_doubtful: bool
     ) -> tuple[Finding | None, Finding | None]:
         """Return why most rays miss each other, and the fault of the timing, each or None.
 
-        The timing is judged if rays miss each other by more than expected (widening above 1).
+        The timing, which takes 0.05 s, is only judged if most rays miss each other, or if the rig
+        is doubtful for another reason.
         """
         timing = None
-        if widening > 1:
+        if is_doubtful or self._misses.finding() is not None:
             timing = timing_fault(list(self._recent), self._corrected, orientation)
         return self._misses.finding(timing), timing
 

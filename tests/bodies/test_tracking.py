@@ -73,7 +73,8 @@ class Trial:
 @pytest.mark.parametrize('seed', range(4))
 def test_body_is_followed_from_its_first_pose_although_its_speed_is_unknown(seed):
     """At 100 Hz any speed is a turn by 23 degrees in an exposure; half of the exposures have fewer
-    than three markers in space."""
+    than three markers in space.
+    """
     trial = Trial(seed, lost=0.25)
     tracker, _ = trial.follow(rate=100.0)
     poses = poses_of(trial.bodies, tracker.smoothed())

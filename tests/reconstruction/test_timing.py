@@ -160,10 +160,15 @@ def test_a_stream_is_judged_if_its_rays_miss():
     exposures, _ = pair_recording(frames, 'ab', RecordedPairing())
     for exposure, frame in zip(exposures, points, strict=True):
         recent.add(exposure, frame.points)
-    misses, timing = recent.faults(orientation, widening=2.0)
+    misses, timing = recent.faults(orientation, is_doubtful=False)
     assert misses.kind is timing.kind is Kind.FRAMES_DELAYED and misses.numbers['share'] > 0.5
-    misses, timing = recent.faults(orientation, widening=1.0)
-    assert misses.kind is Kind.RAYS_DO_NOT_MEET and timing is None
+    slow = RecentExposures(lambda frame: corrected_view(frame, calibrations[frame.fluoroscope]))
+    frames = recorded(2)
+    points, _ = reconstruct_recording(frames, calibrations, Intersector(orientation))
+    for exposure, frame in zip(pair_recording(frames, 'ab', RecordedPairing())[0], points):
+        slow.add(exposure, frame.points)
+    assert slow.faults(orientation, is_doubtful=False) == (None, None)
+    assert slow.faults(orientation, is_doubtful=True)[1].kind is Kind.FRAMES_DELAYED
 
 
 def test_a_delay_is_the_cause_if_most_rays_miss():

@@ -458,14 +458,16 @@ def _smoothed_covariance(
     """Return P - P N P (B, 18, 18).
 
     Where a body appears, variances decrease by twelve digits, which cancel in the difference.
-    There it is L (I - L'NL) L' with P = LL', whose middle factor gets no negative eigenvalues.
+    There it is L (I - L'NL) L' with P = LL', whose middle factor gets no negative eigenvalues, nor
+    does P, whose smallest ones may be rounding errors.
     """
     out = covariance - covariance @ n @ covariance
     after, before = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (out, covariance))
     rows = np.flatnonzero((after < LOST_DIGITS * before).any(axis=1))
     if len(rows):
         scale = np.sqrt(np.diagonal(covariance[rows], axis1=1, axis2=2))[:, :, None]
-        root = scale * np.linalg.cholesky(covariance[rows] / (scale * np.swapaxes(scale, 1, 2)))
+        values, vectors = np.linalg.eigh(covariance[rows] / (scale * np.swapaxes(scale, 1, 2)))
+        root = scale * vectors * np.sqrt(np.maximum(values, 0))[:, None]
         values, vectors = np.linalg.eigh(_EYE_STATE - np.swapaxes(root, 1, 2) @ n[rows] @ root)
         root = root @ vectors * np.sqrt(np.maximum(values, 0))[:, None]
         out[rows] = root @ np.swapaxes(root, 1, 2)

@@ -11,6 +11,7 @@ from fluoro_calib_ros.bodies.motion import (
     MotionFilter,
     PoseInformation,
     _smooth,
+    _smoothed_covariance,
     _transition,
     noise_factors,
     pose_after,
@@ -330,3 +331,16 @@ def test_rotations_of_full_turns_are_followed():
     assert motion.velocity[40:80, 0, 3:] == pytest.approx(
         np.tile([12.0, 0, 16.0], (40, 1)), abs=0.3
     )
+
+
+def test_covariance_that_rounding_has_made_indefinite_is_smoothed():
+    """As after contradicting exposures, when a variance has decreased by many digits."""
+    rng = np.random.default_rng(3)
+    axes = np.linalg.qr(rng.normal(size=(18, 18)))[0]
+    spread = np.geomspace(1e-9, 1, 18)
+    covariance = (axes * np.r_[-1e-9, spread[1:]]) @ axes.T
+    known = 1e12 * np.outer(axes[:, -1], axes[:, -1])  # information on the largest direction
+    smoothed = _smoothed_covariance(covariance[None], (known / (1 + known.max()))[None])[0]
+    assert np.isfinite(smoothed).all() and np.linalg.eigvalsh(smoothed)[0] > -1e-15
+    unknown = _smoothed_covariance(covariance[None], np.zeros((1, 18, 18)))[0]
+    np.testing.assert_allclose(unknown, covariance)

@@ -237,7 +237,13 @@ class CalibrationFiles:
             return
         try:
             loaded, orientation = self.load(directory)
-            self._check_phantom()
+            phantom, path = self._rig.phantom, directory / PHANTOM_FILE
+            if phantom and path.exists() and not phantom.equals(read_phantom(path)):
+                raise DataError(
+                    f'{directory}: its calibrations were made with another phantom than '
+                    f'{self._rig.settings().node.phantom}; use another calibration_directory, or '
+                    'load them by the service load_calibration'
+                )
         except (DataError, OSError) as error:
             self._output.load_fault = str(error)
             self._logger.error(f'no calibration loaded: {error}')
@@ -337,19 +343,6 @@ class CalibrationFiles:
             return stored_verdict(directory)
         except DataError:  # already reported by disagreements()
             return Verdict()
-
-    def _check_phantom(self) -> None:
-        """Raise DataError if the saved calibrations were made with another phantom."""
-        directory = self._rig.directory
-        phantom = self._rig.phantom
-        path = directory / PHANTOM_FILE
-        if phantom is None or not path.exists() or phantom.equals(read_phantom(path)):
-            return
-        raise DataError(
-            f'{directory}: its calibrations were made with another phantom than '
-            f'{self._rig.settings().node.phantom}; use another calibration_directory, or load '
-            'them by the service load_calibration'
-        )
 
 
 def check_folders(directory: Path, base: Path, limit: int) -> None:

@@ -162,7 +162,13 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Fol
         raise StartError(f'parameter {mode} is not set: it names the file {example}')
     try:
         if mode == 'phantom':
-            return _of_phantom(expand_path(path), settings.node, logger)
+            survey = read_survey(expand_path(path))
+            for note in survey.notes:
+                logger.warning(note)
+            distance = settings.node.principal_distance or None
+            return [
+                PhantomSettings(n, survey.phantom, distance) for n in settings.node.fluoroscopes
+            ]
         first = _first_markers(expand_path(path), settings.node.fluoroscopes) if path else {}
         if settings.node.calibration_directory:
             return [_joined(settings, first)]
@@ -171,17 +177,6 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Fol
         ]
     except DataError as error:
         raise StartError(str(error)) from None
-
-
-def _of_phantom(
-    path: Path, parameters: ExtractionParameters, logger: Logger
-) -> Sequence[FollowerSettings]:
-    """Return the follower settings of each fluoroscope. Raises DataError."""
-    survey = read_survey(path)
-    for note in survey.notes:
-        logger.warning(note)
-    distance = parameters.principal_distance or None
-    return [PhantomSettings(name, survey.phantom, distance) for name in parameters.fluoroscopes]
 
 
 def _first_markers(path: Path, names: Sequence[str]) -> dict[str, FirstMarkers]:

@@ -15,7 +15,6 @@ from functools import partial
 from fluoro_calib_msgs.msg import DriftStatus
 from rclpy.task import Future
 
-from ..bodies.body import Body
 from ..bodies.shapes import LearnedShapes
 from ..errors import DataError, ErrorsAt
 from ..io.bodies import read_bodies
@@ -42,7 +41,9 @@ class ShapeLearning(RigServices):
 
     def __init__(self, parts: NodeParts) -> None:
         super().__init__(parts)
-        self._bodies = _declared(self._rig.settings().node.learn_bodies)
+        path = self._rig.settings().node.learn_bodies
+        with ErrorsAt('learn_bodies'):
+            self._bodies = read_bodies(expand_path(path)) if path else ()
         self._orientation: RigOrientation | None = None  # orientation in use while learning
         self._window: MarkerCollection | None = None
         self._job: Future | None = None
@@ -156,9 +157,3 @@ class ShapeLearning(RigServices):
         for finding in learned.findings:
             self._logger.warning(finding.sentence)
         self._logger.info(f'shapes of {len(learned.bodies)} bodies learned')
-
-
-def _declared(path: str) -> tuple[Body, ...]:
-    """Return the bodies of a file, none if the path is empty. Raises DataError."""
-    with ErrorsAt('learn_bodies'):
-        return read_bodies(expand_path(path)) if path else ()

@@ -229,7 +229,9 @@ class SessionClient(Node):
             )
         elif function == 'reconstruction':
             count = values.get('exposures reconstructed')
-            self._note_points(_number(count))
+            exposures = _number(count)
+            if math.isfinite(exposures) and (self._points_at or (None,))[0] != exposures:
+                self._points_at = exposures, time.monotonic()
             self._set(
                 points_hz=self._rate(node, function, count, stamp_s),
                 points_latency_ms=(
@@ -242,11 +244,6 @@ class SessionClient(Node):
         elif function == 'drift':
             level = LEVELS[min(int.from_bytes(status.level, 'little'), 2)]
             self._set(drift_level=level, drift=status.message)
-
-    def _note_points(self, count: float) -> None:
-        """Record when the number of reconstructed exposures last changed."""
-        if math.isfinite(count) and (self._points_at is None or self._points_at[0] != count):
-            self._points_at = count, time.monotonic()
 
     def _follow(self, name: str) -> None:
         """Subscribe to the status of a fluoroscope, once."""

@@ -311,14 +311,19 @@ class NeighbourModel(CorrectionModel):
         """Return weights (n, k) of the k nearest training values in the predictions."""
 
     @classmethod
-    @abstractmethod
     def weights_of_candidates(
         cls, candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
     ) -> NDArray[np.float64]:
         """Return weights (n, c) of candidates (c, 2) at uv (n, 2); zero except for the k nearest.
 
-        The lookup grid is built with this method.
+        The lookup grid is built with this method. Override it in a subclass that need not sort.
         """
+        distance2 = np.sum((candidates - uv[:, None]) ** 2, axis=2)
+        index = np.argsort(distance2, axis=1, kind='stable')[:, :k]
+        out = np.zeros(distance2.shape)
+        weights = cls.weights(Neighbourhoods(candidates[index], uv), k)
+        np.put_along_axis(out, index, weights, axis=1)
+        return out
 
     @classmethod
     def candidate_k(cls, count: int) -> NDArray[np.int64]:

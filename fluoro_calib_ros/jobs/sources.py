@@ -149,8 +149,7 @@ def read_content(path: PathLike, settings: FileSettings, part: str, default: str
     if format_ and part not in format_.parts:
         parts = ' and '.join(PARTS[name] for name in format_.parts)
         needed = f'{PARTS[part]} {"is" if part == "survey" else "are"} needed'
-        beads = registry.FORMATS['coordinates']
-        if part == 'survey' and beads.recognise(registry.sample_of(path)):
+        if part == 'survey' and format_.kind in ('dlt', 'mayacam1'):  # rows of numbers
             needed += '; if the rows are beads, name their columns in a header, such as x,y,z'
         raise DataError(
             f'this looks like {format_.title} ({format_.kind}), which has {parts}, but {needed}',

@@ -166,7 +166,7 @@ def _phantom_frames(
             if _is_set(image):
                 place, target_id, uv = _points_of_image(project, survey, image)
                 if len(target_id):
-                    frame = frame_of(place, name, number, target_id, uv, size)
+                    frame = frame_of(place, name, number, target_id, uv=uv, image_size=size)
                     frames.setdefault(name, []).append(frame)
     if not frames:
         raise DataError(f'{project.path}: the project has no calibrated images with points')
@@ -223,7 +223,8 @@ def _trial_frames(
             seen = ~np.isnan(uv).any(axis=1)
             if seen.any():
                 place = f'{where}, frame {number}'
-                frame = frame_of(place, name, number, target_id[seen], uv[seen], size)
+                seen_id, seen_uv = target_id[seen], uv[seen]
+                frame = frame_of(place, name, number, seen_id, uv=seen_uv, image_size=size)
                 frames.setdefault(name, []).append(frame)
     return frames, named_targets(ids)
 

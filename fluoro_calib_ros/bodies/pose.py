@@ -164,11 +164,9 @@ class PoseSolver:
         rotation = np.where(prediction.known[:, None, None], prediction.rotation, np.eye(3))
         centre = np.where(prediction.known[:, None], prediction.centre_mm, 0.0)
         started = prediction.known.copy()
-        near = np.zeros_like(started)
-        if not started.all():
-            pose = rotation, centre, started
-            self._start(exposure, points, np.flatnonzero(~started), pose)
-            near = _start_nearby(points, prediction, pose)
+        pose = rotation, centre, started
+        self._start(exposure, points, np.flatnonzero(~started), pose)
+        near = _start_nearby(points, prediction, pose)
         seen = points.seen.any(axis=2)
         used = seen & started[:, None]
         test = np.full(used.shape, np.nan)

@@ -141,7 +141,7 @@ class BodyTracker:
         variance = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
         known = self.filter.alive & (variance < LOST_SD_RAD**2)
         near = self.filter.alive & ~known
-        expected = Prediction(rotation, centre, covariance, known, self._weak + 1, near)
+        expected = Prediction(rotation, centre, covariance, known, self._weak + 1, near=near)
         self._expected = stamp_ns, expected
         return expected
 

@@ -62,7 +62,7 @@ def test_numbers_are_written_as_they_are(tmp_path):
     assert path.read_text() == '-1.5,name\n-1.5,-1.5,+2,-inf,-1e-05,nan,name,3\n'
 
 
-def test_many_names_are_looked_up_not_searched(tmp_path):
+def test_many_names_are_looked_up_not_searched(tmp_path, monkeypatch):
     """Each id is compared once with those before it, whatever their number."""
     names = Names({f'bead {number}': number for number in range(20_000)})
     write_names(tmp_path, names)
@@ -76,12 +76,8 @@ def test_many_names_are_looked_up_not_searched(tmp_path):
 
         __hash__ = int.__hash__
 
-    before = csv_table.int if hasattr(csv_table, 'int') else int
-    csv_table.int = Counted
-    try:
-        assert read_names(tmp_path).targets == names.targets
-    finally:
-        csv_table.int = before
+    monkeypatch.setattr(csv_table, 'int', Counted, raising=False)
+    assert read_names(tmp_path).targets == names.targets
     assert comparisons < 100_000
 
 

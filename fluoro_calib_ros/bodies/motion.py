@@ -458,20 +458,32 @@ def _smoothed_covariance(
     """Return P - P N P (B, 18, 18).
 
     Where a body appears, variances decrease by twelve digits, which cancel in the difference.
-    There it is L (I - L'NL) L' with P = LL', whose middle factor gets no negative eigenvalues, nor
-    does P, whose smallest ones may be rounding errors.
+    There it is L (I - L'NL) L' with P = LL', whose middle factor gets no negative eigenvalues.
     """
     out = covariance - covariance @ n @ covariance
     after, before = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (out, covariance))
     rows = np.flatnonzero((after < LOST_DIGITS * before).any(axis=1))
     if len(rows):
         scale = np.sqrt(np.diagonal(covariance[rows], axis1=1, axis2=2))[:, :, None]
-        values, vectors = np.linalg.eigh(covariance[rows] / (scale * np.swapaxes(scale, 1, 2)))
-        root = scale * vectors * np.sqrt(np.maximum(values, 0))[:, None]
+        correlation = covariance[rows] / (scale * np.swapaxes(scale, 1, 2))
+        root = scale * np.array([_root(matrix) for matrix in correlation])
         values, vectors = np.linalg.eigh(_EYE_STATE - np.swapaxes(root, 1, 2) @ n[rows] @ root)
         root = root @ vectors * np.sqrt(np.maximum(values, 0))[:, None]
         out[rows] = root @ np.swapaxes(root, 1, 2)
     return out
+
+
+def _root(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a root L of a matrix LL' (s, s).
+
+    Cholesky's keeps the digits of small variances; eigenvalues, without negative ones, are the
+    root of a matrix that rounding has made indefinite.
+    """
+    try:
+        return np.asarray(np.linalg.cholesky(matrix), dtype=float)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(matrix)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0)), dtype=float)
 
 
 def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion:

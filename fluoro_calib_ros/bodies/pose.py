@@ -191,6 +191,9 @@ class PoseSolver:
                 break
             used[contradicting, worst] = False
             used[contradicting[near[contradicting]]] = False  # it may have been elsewhere
+            # Of contradicting points, those that are left must agree beyond what fits any pose.
+            left = (points.seen & used[..., None]).sum(axis=(1, 2))
+            used[contradicting[2 * left[contradicting] <= POSE_SIZE]] = False
         ambiguous = self._ambiguous(solution, points, used, prediction)
         return self._result(solution, (points, used), prediction, test, ambiguous)
 

@@ -442,3 +442,26 @@ def test_iteration_starts_near_a_body_unless_its_markers_contradict_each_other(f
             assert found.markers[0] == 4
             turn = vector_from_matrix(found.rotation[0] @ rotation.T)
             assert np.linalg.norm(turn) < 0.1 and np.abs(found.centre_mm[0] - centre).max() < 1
+
+
+def test_contradicting_points_of_which_any_three_fit_a_pose_give_none():
+    """Of four markers in one view one is false, and the others fit whichever is excluded."""
+    rng = np.random.default_rng(11)
+    rig = orientation()
+    for _ in range(20):
+        given = body(rng, 4)
+        rotation, centre = random_pose(rng)
+        points = (given.xyz_mm - given.centre) @ rotation.T + centre
+        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+        uv[1] = np.nan
+        uv[0, rng.integers(4)] += 30.0
+        expected = replace(
+            UNKNOWN,
+            rotation=rotation[None],
+            centre_mm=centre[None],
+            covariance=np.diag([4.0] * 3 + [0.04] * 3)[None],
+            known=np.ones(1, dtype=bool),
+        )
+        seen = exposure(rig, given.target_id, uv, Noise(0.2))
+        found = PoseSolver(rig, [given]).solve(seen, expected)
+        assert not found.alone[0] and not found.markers[0]

@@ -34,6 +34,8 @@ from .reconstruct import CorrectedView, corrected_view, match_views
 MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
 MIN_SIGMAS = 5.0  # minimum delay over its standard deviation: one in a million by chance
 MAX_FRAMES = 1.0  # maximum delay: neighbouring frames show no motion beyond them
+WHOLE = 0.1  # maximum difference of an uncertain delay from a frame interval that it may be
+MIN_NOISE_PX = 1e-3  # minimum noise of image points
 # Minimum share of the squared misses, beyond their noise and what a changed rig explains, that a
 # delay explains: it is their main cause. Without a delay, unknown distortions of 0.3 to 3 px were
 # explained to 0.13 at most; half an interval beside one of 0.3 px was to 0.79 at least.
@@ -256,7 +258,7 @@ def delay_finding(names: tuple[str, str], delay: Delay, interval_s: float) -> Fi
     """
     first, name = names
     size = abs(delay.frames)
-    if size + delay.margin > 1:
+    if size > 1 - min(delay.margin, WHOLE):  # a whole interval is the likelier cause
         shift = -1 if delay.frames > 0 else 1
         cause = (
             f'the frame numbers of fluoroscope {name} are too {"small" if shift < 0 else "large"} '
@@ -309,7 +311,8 @@ def _motion(
         found = [geometry.residuals(in_a, uv, sigma_a, sigma_b) for uv in in_b]
         by_rig = geometry.by_essential(in_a, in_b[1])
         # An error of the correction is the same in neighbouring frames: it is no noise.
-        noise_a, _, noise_b, _ = matched.sigma**2 - matched.correction_sd**2
+        noise = np.maximum(matched.sigma**2 - matched.correction_sd**2, MIN_NOISE_PX**2)
+        noise_a, _, noise_b, _ = noise
         of_b = found[1].factor_b ** 2 * noise_b
         part = Motion(
             np.asarray(matched.target_id),

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rigs import refused, true_calibrations, true_orientation
+from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.exposures.pairing import RecordedPairing
@@ -20,7 +21,15 @@ from fluoro_calib_ros.reconstruction.reconstruct import (
     pair_recording,
     reconstruct_recording,
 )
-from fluoro_calib_ros.reconstruction.timing import RecentExposures, timing_of_recording
+from fluoro_calib_ros.reconstruction.timing import (
+    KEPT,
+    LOSS,
+    ROBUST,
+    Delay,
+    RecentExposures,
+    delay_finding,
+    timing_of_recording,
+)
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
@@ -135,6 +144,42 @@ def test_a_lost_frame_is_named(name):
 
 def test_a_lost_frame_is_not_named_beside_another_fault():
     assert found(dented(without(recorded(0), 'b', 60))) is None
+
+
+def test_noise_has_the_stated_losses():
+    def mean(function):
+        def density(x):
+            return function(x) * np.exp(-x * x / 2) / np.sqrt(2 * np.pi)
+
+        return quad(density, -20, 20)[0]
+
+    assert mean(lambda x: np.log1p((x / ROBUST) ** 2)) == pytest.approx(LOSS, abs=5e-4)
+    kept = mean(lambda x: x * x / (1 + (x / ROBUST) ** 2))
+    assert kept / mean(lambda x: 1 / (1 + (x / ROBUST) ** 2)) == pytest.approx(KEPT, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('frames', 'sd', 'kind'),
+    [
+        (0.9, 0.01, Kind.FRAMES_DELAYED),
+        (0.99, 0.01, Kind.FRAMES_SHIFTED),
+        (-0.8, 0.05, Kind.FRAMES_DELAYED),
+        (-0.95, 0.02, Kind.FRAMES_SHIFTED),
+    ],
+)
+def test_a_delay_of_a_whole_interval_is_a_wrong_number(frames, sd, kind):
+    assert delay_finding(('a', 'b'), Delay(frames, sd, 1.0), 0.0).kind is kind
+
+
+def test_points_without_noise_are_judged():
+    calibrations, orientation = known()
+    exact = {
+        name: [replace(f, sigma=np.full(len(f.uv), 1e-12)) for f in frames]
+        for name, frames in recorded(2).items()
+    }
+    exposures, _ = pair_recording(exact, 'ab', RecordedPairing())
+    with np.errstate(all='raise'):
+        timing_of_recording(exposures, calibrations, orientation)
 
 
 def test_points_at_rest_and_short_recordings_tell_nothing():

@@ -61,6 +61,7 @@ class PairWait:
     count: int
     collected: bool = False  #: whether it is for pairs that become exposures
     pairs: list[Mapping[str, Frame]] = field(default_factory=list)
+    exposures: int = 0  #: number of exposures with the last pair
     done: Future = field(default_factory=Future)
 
 
@@ -193,6 +194,7 @@ class ExposureInput:
     def _give(self, pair: Mapping[str, Frame], wait: PairWait) -> None:
         """Give a pair to a wait, which ends with its last one."""
         wait.pairs.append(pair)
+        wait.exposures = len(self._collector.exposures)
         if len(wait.pairs) == wait.count:
             self._waits.remove(wait)
             wait.done.set_result(None)
@@ -357,11 +359,12 @@ class CollectServices(RigServices):
             await within(self._node, timeout, wait.done, lambda: self._exposures.give_up(wait))
         names = self._rig.names
         response.success = bool(wait.pairs)
-        response.exposures = self._exposures.collected(names[0]).exposures
+        response.exposures = wait.exposures
         if wait.pairs:
             first = wait.pairs[0][names[0]]
             response.message = f'frame {first.number} captured, {response.exposures} exposures now'
         else:
+            response.exposures = self._exposures.collected(names[0]).exposures
             streams = self._exposures.streams.values()
             received = ', '.join(f'{stream.name} {stream.received}' for stream in streams)
             response.message = self._exposures.capture_refusal or (

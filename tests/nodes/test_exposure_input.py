@@ -105,3 +105,11 @@ def test_a_wait_for_pairs_ends_with_its_last_pair_or_is_given_up(exposures):
         exposures.add(name, observed(name, 3, 0))
     assert len(wait.pairs) == len(other.pairs) == 2
     assert exposures.collected('a').exposures == 0
+
+
+def test_each_capture_has_the_number_of_exposures_with_its_own(exposures):
+    captures = [exposures.next_pairs(collected=True) for _ in range(3)]
+    for number in (1, 2, 3):
+        for name in 'ab':
+            exposures.add(name, observed(name, number, 0))
+    assert [capture.exposures for capture in captures] == [1, 2, 3]

@@ -413,16 +413,21 @@ def test_observations_with_an_error_in_common_tell_no_more_than_it_allows():
     assert told == pytest.approx(np.sum(np.linalg.inv(covariance)), rel=1e-9)
 
 
+def body_in_two_views(rng, rig):
+    """A body of four markers, its pose, and its image points (2, 4, 2)."""
+    given = body(rng, 4)
+    rotation, centre = random_pose(rng)
+    points = (given.xyz_mm - given.centre) @ rotation.T + centre
+    return given, (rotation, centre), project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+
+
 @pytest.mark.parametrize('false_px', [0.0, 20.0])
 def test_iteration_starts_near_a_body_unless_its_markers_contradict_each_other(false_px):
     """Two of the four markers are in space, the others only in one view."""
     rng = np.random.default_rng(9)
     rig = orientation()
     for _ in range(20):
-        given = body(rng, 4)
-        rotation, centre = random_pose(rng)
-        points = (given.xyz_mm - given.centre) @ rotation.T + centre
-        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+        given, (rotation, centre), uv = body_in_two_views(rng, rig)
         uv[1, 2:] = np.nan
         uv[0, 2] += false_px
         away = Rotation.from_rotvec(rng.normal(0, 0.2, 3)).as_matrix()
@@ -449,10 +454,7 @@ def test_contradicting_points_of_which_any_three_fit_a_pose_give_none():
     rng = np.random.default_rng(11)
     rig = orientation()
     for _ in range(20):
-        given = body(rng, 4)
-        rotation, centre = random_pose(rng)
-        points = (given.xyz_mm - given.centre) @ rotation.T + centre
-        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+        given, (rotation, centre), uv = body_in_two_views(rng, rig)
         uv[1] = np.nan
         uv[0, rng.integers(4)] += 30.0
         expected = replace(

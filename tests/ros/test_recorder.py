@@ -152,13 +152,13 @@ def test_publisher_that_restarts_with_another_quality_of_service_is_recorded(
     for number, profile in enumerate(profiles, 1):
         publisher = client.create_publisher(String, topic, profile)
 
-        def offered():
-            (info,) = client.get_subscriptions_info_by_topic(topic)
-            got = info.qos_profile
-            return got.reliability, got.durability
+        def requested():
+            # none while the recorder renews its subscription
+            found = client.get_subscriptions_info_by_topic(topic)
+            return [(info.qos_profile.reliability, info.qos_profile.durability) for info in found]
 
-        client.wait_until(lambda: client.get_subscriptions_info_by_topic(topic))
-        client.wait_until(lambda: offered() == (profile.reliability, profile.durability))
+        expected = [(profile.reliability, profile.durability)]
+        client.wait_until(lambda: requested() == expected, what='the renewed subscription')
         client.wait_until(publisher.get_subscription_count, what='the subscription')
         client.wait_until_known_to('recorder_node')
         publisher.publish(String(data='x'))

@@ -31,7 +31,7 @@ from fluoro_calib_ros.jobs.healing import heal_rig
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.reconstruct import intersect_frames
+from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_exposure
 from tools.sections import write_section
 
 from .bodies import table
@@ -140,8 +140,8 @@ class Found:
             levels.append(watch is not None and watch.state.level != OK)
             wide = watch.widened(intersector)[0] if watch else intersector
             tracker.use(wide.orientation)
-            found, present = intersect_frames(exposure, calibrations, intersector, scatter, watch)
-            tracked = tracker.add(found, present[0].number, present[0].stamp_ns)
+            found = reconstruct_exposure(exposure, calibrations, intersector, watch, scatter)
+            tracked = tracker.add(found.intersected, found.number, found.stamp_ns)
             assert tracked is not None
             truth = stream.points[row].reshape(-1, 3)
             own = np.isin(found.target_id, np.arange(1000))

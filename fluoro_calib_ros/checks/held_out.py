@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
-from ..correction.registry import no_correction
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import ResidualTable
@@ -34,19 +32,6 @@ from .residual_tests import RejectedExposure, noise_of, residuals_of
 
 MAX_NOISE = 2.0  # maximum RMSE of image points over their noise
 CORRECTED = 0.6  # RMSE without over RMSE with correction, of points that are already corrected
-
-
-def uncorrected(calibrations: Calibrations) -> dict[str, FluoroscopeCalibration]:
-    """Return calibrations without corrections, to test for points that are already corrected."""
-    return {
-        name: replace(
-            calibration,
-            model=no_correction(),
-            train_exposure=np.zeros(0, dtype=np.int64),
-            angle_field=None,
-        )
-        for name, calibration in calibrations.items()
-    }
 
 
 def misfits(

@@ -28,7 +28,7 @@ from .angle_field import AngleField, packed_angles, unpacked_angles
 from .base import Correction, CorrectionModel, CorrectionStatus
 from .calibration_record import FIELDS, Field
 from .grid import CorrectionGrid
-from .registry import MODEL_FIELDS, model_from_values
+from .registry import MODEL_FIELDS, model_from_values, no_correction
 from .series import SERIES_FIELDS, Functions, Series
 
 MAX_FACTOR = 10.0  # maximum estimated ratio of the factors of border and middle, or of its inverse
@@ -482,3 +482,16 @@ Calibrations = Mapping[str, FluoroscopeCalibration]  # by name of the fluoroscop
 def ids_of(calibrations: Calibrations) -> dict[str, str]:
     """Return the ids of calibrations by fluoroscope."""
     return {name: calibration.calibration_id for name, calibration in calibrations.items()}
+
+
+def uncorrected(calibrations: Calibrations) -> dict[str, FluoroscopeCalibration]:
+    """Return calibrations without corrections, to test for points that are already corrected."""
+    return {
+        name: replace(
+            calibration,
+            model=no_correction(),
+            train_exposure=np.zeros(0, dtype=np.int64),
+            angle_field=None,
+        )
+        for name, calibration in calibrations.items()
+    }

@@ -23,11 +23,11 @@ from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
 from ..brief import brief_repr
-from ..checks.rig_watch import RecordingDriftWatch, RigEvidence
+from ..checks.rig_watch import RigEvidence
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.frame import Frame, Frames
-from ..exposures.pairing import RecordedPairing, disagreement_of_recording
+from ..exposures.frame import Frames
+from ..exposures.pairing import RecordedPairing
 from ..exposures.stamps import NS_PER_S
 from ..findings import Finding, Kind, Place, Severity, sentences
 from ..images.corrector import iterated
@@ -41,18 +41,14 @@ from ..io.image_reading import ImageSource
 from ..io.image_writing import write_video
 from ..options import option
 from ..photogrammetry.collinearity import project
-from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints, Intersector
-from ..reconstruction.observed_noise import with_observed_noise
+from ..reconstruction.intersection import OK, OUTSIDE
 from ..reconstruction.reconstruct import (
     IntersectedViews,
-    intersect_frames,
     orientation_of_recorded,
-    pair_recording,
 )
 from .image_sources import fluoroscope_folders, is_image_bag, open_sources
-from .reconstruction import check_orientation, check_rays
+from .reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstructed_rays
 
 FILM_HZ = 25.0  # slow motion, because players cannot show 250 images per second
 
@@ -315,17 +311,17 @@ def track_bodies(
     recording = intersected(
         frames, calibrations, orientation, options, lambda done, total: step(done, 2 * total)
     )
-    exposures = recording.exposures
+    exposures = recording.frames
     shapes = [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
     if options.estimate_shapes:
-        shapes = estimated_shapes(bodies, recording)
+        shapes = estimated_shapes(bodies, recording, calibrations)
     solvable = solvable_bodies([shape.body for shape in shapes])
     lag = options.lag if options.smooth == 'lag' else None
     tracker = BodyTracker(orientation, solvable, options.reject, lag)
     tracked = []
     for count, exposure in enumerate(exposures, 1):
         tracker.use(exposure.orientation)
-        tracked_exposure = tracker.add(exposure.views, exposure.number, exposure.stamp_ns)
+        tracked_exposure = tracker.add(exposure.intersected, exposure.number, exposure.stamp_ns)
         if tracked_exposure is not None:
             tracked.append(tracked_exposure)
         step(len(exposures) + count, 2 * len(exposures))
@@ -352,85 +348,29 @@ def track_bodies(
     )
 
 
-@dataclass(frozen=True)
-class IntersectedExposure:
-    """Exposure of a recording with its points in space."""
-
-    number: int
-    stamp_ns: int
-    views: IntersectedViews
-    orientation: RigOrientation  #: with the covariance widened after a drift alarm
-
-    @property
-    def target_id(self) -> NDArray[np.int64]:
-        """Target ids (n,) of the points."""
-        return self.views.target_id
-
-    @property
-    def points(self) -> IntersectedPoints:
-        """The points in space."""
-        return self.views.points
-
-
-@dataclass(frozen=True)
-class IntersectedRecording(RigEvidence):
-    """Intersected exposures of a recording, and what its rays say about the rig."""
-
-    exposures: list[IntersectedExposure]
-    sides: NDArray[np.float64]  #: (F,) longer sides of the images [px]
-    unpaired: Mapping[str, int]  #: number of frames without partner, by fluoroscope
-
-
 def intersected(
     frames: Frames,
     calibrations: Calibrations,
     orientation: RigOrientation,
     options: BodiesOptions,
     progress: Callable[[int, int], None] | None = None,
-) -> IntersectedRecording:
+) -> ReconstructionOutcome:
     """Pair and intersect the frames of a recording. Raises DataError, as `reconstruct` does."""
-    check_orientation(orientation, calibrations)
-    names = orientation.fluoroscopes
-    frames, noise = with_observed_noise(frames, calibrations, orientation, options)
-    paired, unpaired = pair_recording(frames, names, options)
-    if not paired:
-        raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
-    intersector = Intersector(orientation, options.reject)
-    scatter = ObservedScatter()
-    timed = has_times(frames)
-    sizes = {name: calibrations[name].image_size for name in names}
-    watch = RecordingDriftWatch(orientation, sizes)
-    out = []
-    for count, exposure in enumerate(paired, 1):
-        if options.rate is not None and not timed:
-            exposure = _stamped(exposure, options.rate)
-        widened, _ = watch.widened(intersector)
-        views, present_frames = intersect_frames(
-            exposure, calibrations, intersector, scatter, watch
-        )
-        first = present_frames[0]
-        out.append(IntersectedExposure(first.number, first.stamp_ns, views, widened.orientation))
-        if progress is not None:
-            progress(count, len(paired))
-    stamps = np.array([entry.stamp_ns for entry in out])
-    if len(out) > 1 and not (np.diff(stamps) > 0).all():
+    if options.rate is not None and not has_times(frames):
+        frames = _stamped(frames, options.rate)
+    outcome, _ = reconstructed_rays(
+        frames,
+        calibrations,
+        orientation,
+        ReconstructionOptions(options.pair_by, options.pair_tolerance, reject=options.reject),
+        progress,
+    )
+    stamps = np.array([frame.stamp_ns for frame in outcome.frames])
+    if len(stamps) > 1 and not (np.diff(stamps) > 0).all():
         raise DataError(
             'the exposures have no times, or times out of order; give the rate of the recording'
         )
-    timing = check_rays(out, frames, calibrations, intersector, options, widening=scatter.factor)
-    disagreement = ''
-    if timed and options.pair_by == 'frame_number':
-        disagreement = disagreement_of_recording({name: frames[name] for name in names})
-    return IntersectedRecording(
-        out,
-        sides=np.array([float(max(sizes[name])) for name in names]),
-        unpaired=unpaired,
-        drift=watch.verdict().beside(timing),
-        disagreement=disagreement,
-        widening=scatter.factor,
-        noise=noise,
-        timing=timing,
-    )
+    return outcome
 
 
 def has_times(frames: Frames) -> bool:
@@ -438,23 +378,28 @@ def has_times(frames: Frames) -> bool:
     return any(frame.stamp_ns for exposures in frames.values() for frame in exposures)
 
 
-def _stamped(exposure: Mapping[str, Frame], rate: float) -> dict[str, Frame]:
-    """Return the frames of an exposure with the time of their number at a rate [Hz]."""
+def _stamped(frames: Frames, rate: float) -> Frames:
+    """Return the frames of a recording with the times of their numbers at a rate [Hz]."""
     return {
-        name: replace(frame, stamp_ns=1 + round(frame.number * NS_PER_S / rate))
-        for name, frame in exposure.items()
+        name: [
+            replace(frame, stamp_ns=1 + round(frame.number * NS_PER_S / rate))
+            for frame in view_frames
+        ]
+        for name, view_frames in frames.items()
     }
 
 
 def estimated_shapes(
-    bodies: Sequence[Body], recording: IntersectedRecording
+    bodies: Sequence[Body], recording: ReconstructionOutcome, calibrations: Calibrations
 ) -> list[EstimatedShape]:
     """Estimate the shapes of bodies from exposures spread evenly over the recording."""
-    exposures = recording.exposures
+    exposures = recording.frames
     rows = np.unique(np.linspace(0, len(exposures) - 1, SHAPE_EXPOSURES).astype(int))
-    sampled = [exposures[row].views for row in rows]
+    sampled = [exposures[row].intersected for row in rows]
+    names = recording.orientation.fluoroscopes
+    sides = np.array([float(max(calibrations[name].image_size)) for name in names])
     ids = [views.target_id for views in sampled]
-    points = [_split(views, recording.sides) for views in sampled]
+    points = [_split(views, sides) for views in sampled]
     return [estimate_shape(body, places_of(body, ids, points)) for body in bodies]
 
 
@@ -500,10 +445,11 @@ def _poses_alone(
     options: BodiesOptions,
 ) -> list[BodyPoses]:
     """Return the unsmoothed poses in another recording. Raises DataError."""
-    exposures = intersected(frames, calibrations, orientation, options).exposures
+    exposures = intersected(frames, calibrations, orientation, options).frames
     tracker = BodyTracker(orientation, bodies, options.reject)
     tracked = [
-        tracker.add(exposure.views, exposure.number, exposure.stamp_ns) for exposure in exposures
+        tracker.add(exposure.intersected, exposure.number, exposure.stamp_ns)
+        for exposure in exposures
     ]
     return poses_alone(bodies, [exposure for exposure in tracked if exposure is not None])
 

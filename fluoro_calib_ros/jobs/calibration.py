@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..checks.check import Validation
-from ..checks.held_out import corrected_already, misfits, poor_fits, uncorrected
+from ..checks.held_out import corrected_already, misfits, poor_fits
 from ..checks.inputs import (
     copied_exposures,
     doubtful_image_sizes,
@@ -36,7 +36,11 @@ from ..checks.inputs import (
 from ..checks.mixed_units import mixed_units
 from ..checks.rig import RigFindings, interchanged, rig_findings
 from ..checks.verdict import validate_or_report
-from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import (
+    Calibrations,
+    FluoroscopeCalibration,
+    uncorrected,
+)
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations, calibrate_request
 from ..estimation.fixed_calibration import with_comparable_sigma

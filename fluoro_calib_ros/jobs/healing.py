@@ -53,7 +53,7 @@ from ..io.versions import HEALING, LEARNED_SHAPES, write_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
-from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
+from ..reconstruction.reconstruct import Recording, orientation_of_recorded
 from ..reconstruction.timing import timing_of_recording
 
 BLOCKS = 10  # blocks of a recording, alternately used for the diagnosis and for its verdict
@@ -216,15 +216,16 @@ def _exposures_of(
 ) -> tuple[list[dict[str, Frame]], Finding | None]:
     """Return the exposures that show bodies, and a finding on their noise. Raises DataError."""
     markers = np.concatenate([body.target_id for body in bodies])
-    marker_frames = frames_of_targets(frames, markers)
-    frames_with_noise, noise = with_observed_noise(
-        marker_frames, calibrations, orientation, options, must_explain=False
+    recording, noise = with_observed_noise(
+        Recording(
+            frames_of_targets(frames, markers), calibrations, Intersector(orientation), options
+        ),
+        must_explain=False,
     )
-    paired, _ = pair_recording(frames_with_noise, orientation.fluoroscopes, options)
-    fault = timing_of_recording(paired, calibrations, orientation)
+    fault = timing_of_recording(recording)
     if fault is not None:  # it would look like a change of the rig
         raise DataError(fault)
-    return paired, noise
+    return recording.exposures, noise
 
 
 def _check_seen(poses: Poses) -> None:

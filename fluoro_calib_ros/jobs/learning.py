@@ -79,11 +79,11 @@ def learn_shapes(
     markers = np.concatenate([body.target_id for body in bodies])
     seen = frames_of_targets(frames, markers)
     recording = intersected(seen, calibrations, recorded, options, progress)
-    exposures = recording.exposures
+    exposures = recording.frames
     drift = recording.drift
     if drift is not None and drift.state is not None:
         raise DataError(replace(drift.finding, advice='no shapes are learned during a drift'))
-    shapes = estimated_shapes(bodies, recording)
+    shapes = estimated_shapes(bodies, recording, calibrations)
     learned = [_known(shape.body) for shape in shapes if _is_good(shape)]
     findings = [finding for shape in shapes for finding in shape.findings]
     if not learned:

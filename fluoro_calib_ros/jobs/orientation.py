@@ -11,9 +11,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from ..brief import brief_repr
-from ..checks.held_out import uncorrected
 from ..checks.inputs import require_phantom
-from ..correction.fluoroscope_calibration import Calibrations
+from ..correction.fluoroscope_calibration import Calibrations, uncorrected
 from ..errors import DataError
 from ..estimation.rig_orientation import orientation_of_capture, standing_frames
 from ..exposures.frame import Frames

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,15 +24,14 @@ from ..io.bodies import point_table
 from ..options import option
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.epipolar import ExposurePoints, why_rays_miss
+from ..reconstruction.epipolar import why_rays_miss
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.lost_targets import lost_targets
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import (
     ReconstructedFrame,
+    Recording,
     orientation_of_recorded,
-    pair_recording,
-    reconstruct_recording,
 )
 from ..reconstruction.timing import timing_of_recording
 
@@ -137,7 +136,23 @@ def reconstruct(
         or corrected, if most rays do not meet, and if all miss each other by a little and a trial
         identifies the cause.
     """
-    options = options or ReconstructionOptions()
+    outcome, recording = reconstructed_rays(
+        frames, calibrations, orientation, options or ReconstructionOptions(), progress
+    )
+    return replace(outcome, lost_targets=tuple(lost_targets(recording, outcome.frames)))
+
+
+def reconstructed_rays(
+    frames: Frames,
+    calibrations: Calibrations,
+    orientation: RigOrientation,
+    options: ReconstructionOptions,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[ReconstructionOutcome, Recording]:
+    """Reconstruct a recording as `reconstruct` does, without a search for lost targets.
+
+    Also returns the recording with the observed noise.
+    """
     if options.pair_by == 'stamp' and not options.has_stamps:
         raise DataError(
             'the recording does not contain the times of its exposures, pair them by frame_number'
@@ -145,71 +160,33 @@ def reconstruct(
     orientation = orientation_of_recorded(frames, orientation)
     check_orientation(orientation, calibrations)
     names = orientation.fluoroscopes
-    frames, noise = with_observed_noise(frames, calibrations, orientation, options)
+    recording, noise = with_observed_noise(
+        Recording(frames, calibrations, Intersector(orientation, options.reject), options)
+    )
     watch, drift = _drift_watch(orientation, calibrations, options)
     scatter = ObservedScatter()
-    intersector = Intersector(orientation, options.reject)
-    reconstructed, unpaired = reconstruct_recording(
-        frames,
-        calibrations,
-        intersector=intersector,
-        pairing=options,
-        watch=watch,
-        scatter=scatter,
-        progress=progress,
-    )
+    reconstructed = recording.reconstruct(watch, scatter, progress)
     if not reconstructed:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
-    timing = check_rays(
-        reconstructed, frames, calibrations, intersector, options, widening=scatter.factor
-    )
-    lost = lost_targets(reconstructed, frames, calibrations, intersector, options)
+    timing = timing_of_recording(recording)
+    finding = why_rays_miss(recording, reconstructed, scatter.factor, timing)
+    if finding is not None:
+        raise DataError(finding)
     disagreement = ''
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
     drift = watch.verdict() if watch else drift
-    drift = drift and drift.beside(timing)
-    return ReconstructionOutcome(
+    outcome = ReconstructionOutcome(
         reconstructed,
-        unpaired,
+        recording.unpaired,
         orientation=orientation,
-        drift=drift,
+        drift=drift and drift.beside(timing),
         disagreement=disagreement,
         widening=scatter.factor,
-        lost_targets=tuple(lost),
         noise=noise,
         timing=timing,
     )
-
-
-def check_rays(
-    reconstruction: Sequence[ExposurePoints],
-    frames: Frames,
-    calibrations: Calibrations,
-    intersector: Intersector,
-    pairing: RecordedPairing,
-    widening: float,
-) -> Finding | None:
-    """Return the fault of the timing of a recording, or None.
-
-    The parameters are those of `why_rays_miss`. Raises DataError if the reconstruction is
-    implausible.
-    """
-    orientation = intersector.orientation
-    exposures, _ = pair_recording(frames, orientation.fluoroscopes, pairing)
-    timing = timing_of_recording(exposures, calibrations, orientation)
-    finding = why_rays_miss(
-        reconstruction,
-        frames,
-        calibrations,
-        intersector,
-        pairing=pairing,
-        widening=widening,
-        timing=timing,
-    )
-    if finding is not None:
-        raise DataError(finding)
-    return timing
+    return outcome, recording
 
 
 def check_orientation(orientation: RigOrientation, calibrations: Calibrations) -> None:

@@ -21,16 +21,13 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..correction.fluoroscope_calibration import Calibrations
-from ..correction.registry import no_correction
+from ..correction.fluoroscope_calibration import uncorrected
 from ..errors import DataError
-from ..exposures.frame import Frame, Frames
-from ..exposures.pairing import RecordedPairing
+from ..exposures.frame import Frame
 from ..findings import Finding, Kind
 from ..photogrammetry.noise import MAX_WIDENING
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
@@ -43,9 +40,8 @@ from .intersection import (
     SINGLE_VIEW,
     STATUS_NAMES,
     IntersectedPoints,
-    Intersector,
 )
-from .reconstruct import numbered_by_exposure, reconstruct_recording
+from .reconstruct import ReconstructedFrame, Recording
 
 MIN_BASE = 1e-6  # minimum distance of the sources over their distance from the origin of the rig
 
@@ -208,23 +204,7 @@ BETTER = 0.3
 CLOSER = 0.6
 
 
-class ExposurePoints(Protocol):
-    """Points of an exposure, such as a ReconstructedFrame."""
-
-    @property
-    def number(self) -> int:
-        """Number of the exposure."""
-
-    @property
-    def target_id(self) -> NDArray[np.int64]:
-        """Target ids (n,)."""
-
-    @property
-    def points(self) -> IntersectedPoints:
-        """Points of the targets."""
-
-
-Trial = tuple[Finding, dict[str, list[Frame]]]
+Trial = tuple[Finding, Recording]
 
 
 class RecentMisses:
@@ -258,7 +238,7 @@ def missing_rays(share: float, reason: Finding) -> Finding:
     return replace(reason, cause=cause, numbers={**reason.numbers, 'share': share})
 
 
-def share_rejected(reconstructed: Sequence[ExposurePoints]) -> tuple[float, int]:
+def share_rejected(reconstructed: Sequence[ReconstructedFrame]) -> tuple[float, int]:
     """Return the share of rejected points, and the number of points in two views."""
     status = np.concatenate([frame.points.status for frame in reconstructed] or [np.empty(0, int)])
     rejected, total, _ = _counts(status)
@@ -273,11 +253,8 @@ def _counts(status: NDArray[np.integer]) -> tuple[int, int, int]:
 
 
 def why_rays_miss(
-    reconstruction: Sequence[ExposurePoints],
-    frames: Frames,
-    calibrations: Calibrations,
-    intersector: Intersector,
-    pairing: RecordedPairing,
+    recording: Recording,
+    reconstruction: Sequence[ReconstructedFrame],
     widening: float,
     timing: Finding | None = None,
 ) -> Finding | None:
@@ -291,19 +268,13 @@ def why_rays_miss(
         share, total = share_rejected(reconstruction)
         most_miss = total >= MIN_POINTS and share > MAX_REJECTED
         return missing_rays(share, timing) if most_miss else None
-    finding = mismatch(reconstruction, frames, calibrations, intersector, pairing)
+    finding = mismatch(recording, reconstruction)
     if finding is None and widening >= MAX_WIDENING:
-        finding = cause_of_misses(reconstruction, frames, calibrations, intersector, pairing)
+        finding = cause_of_misses(recording, reconstruction)
     return finding
 
 
-def mismatch(
-    reconstruction: Sequence[ExposurePoints],
-    frames: Frames,
-    calibrations: Calibrations,
-    intersector: Intersector,
-    pairing: RecordedPairing,
-) -> Finding | None:
+def mismatch(recording: Recording, reconstruction: Sequence[ReconstructedFrame]) -> Finding | None:
     """Return why most rays miss each other, or None if most meet."""
     share, total = share_rejected(reconstruction)
     seen = sum(len(frame.target_id) for frame in reconstruction)
@@ -311,42 +282,30 @@ def mismatch(
         return UNMATCHED
     if total < MIN_POINTS or share <= MAX_REJECTED:
         return None
-    names = intersector.orientation.fluoroscopes
-    frames = numbered_by_exposure(frames, names, pairing)
-    for cause, changed in _trials(frames, names, _largest(reconstruction)):
-        reconstructed, _ = reconstruct_recording(changed, calibrations, intersector, pairing)
-        rejected, count = share_rejected(reconstructed)
+    for cause, trial in _trials(recording.numbered(), _largest(reconstruction)):
+        rejected, count = share_rejected(trial.reconstruct())
         if count >= MIN_POINTS and rejected < BETTER * share:
             return missing_rays(share, cause)
     return missing_rays(share, UNKNOWN)
 
 
 def cause_of_misses(
-    reconstruction: Sequence[ExposurePoints],
-    frames: Frames,
-    calibrations: Calibrations,
-    intersector: Intersector,
-    pairing: RecordedPairing,
+    recording: Recording, reconstruction: Sequence[ReconstructedFrame]
 ) -> Finding | None:
     """Return why rays miss each other by more than expected, or None if no trial identifies it.
 
     The trials are those of `mismatch`, and image points that are already corrected.
     """
-    names = intersector.orientation.fluoroscopes
-    frames = numbered_by_exposure(frames, names, pairing)
+    recording = recording.numbered()
     numbers = _largest(reconstruction)
     limit = CLOSER * _miss([frame for frame in reconstruction if frame.number in numbers])
-    uncorrected = {
-        name: replace(calibrations[name], model=no_correction(), angle_field=None)
-        for name in names
-    }
-    selected = {name: [f for f in frames[name] if f.number in numbers] for name in names}
-    trials = [(CORRECTED, selected), *_trials(frames, names, numbers)]
-    misses = []
-    for cause, changed in trials:
-        trial_calibrations = uncorrected if cause is CORRECTED else calibrations
-        reconstructed, _ = reconstruct_recording(changed, trial_calibrations, intersector, pairing)
-        misses.append(_miss(reconstructed))
+    as_corrected = replace(
+        recording,
+        frames=recording.selected(numbers),
+        calibrations=uncorrected(recording.calibrations),
+    )
+    trials = [(CORRECTED, as_corrected), *_trials(recording, numbers)]
+    misses = [_miss(trial.reconstruct()) for _, trial in trials]
     best = int(np.argmin(misses))
     if not misses[best] < limit:
         return None
@@ -355,13 +314,13 @@ def cause_of_misses(
     return replace(found, cause=text)
 
 
-def _largest(reconstructed: Sequence[ExposurePoints]) -> set[int]:
+def _largest(reconstructed: Sequence[ReconstructedFrame]) -> set[int]:
     """Return the numbers of the frames with the most targets, for trials of causes."""
     largest = sorted(reconstructed, key=lambda frame: -len(frame.target_id))[:MAX_TRIED]
     return {frame.number for frame in largest}
 
 
-def _miss(reconstructed: Sequence[ExposurePoints]) -> float:
+def _miss(reconstructed: Sequence[ReconstructedFrame]) -> float:
     """Return the median miss of the rays over its standard deviation; infinite for few rays."""
     points = [frame.points for frame in reconstructed]
     size = np.concatenate([p.standardised[p.status != SINGLE_VIEW] for p in points] or [[]])
@@ -370,13 +329,14 @@ def _miss(reconstructed: Sequence[ExposurePoints]) -> float:
     return float(np.median(np.where(np.isfinite(size), size, np.inf)))
 
 
-def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Trial]:
-    """Return findings on possible confusions, each with the frames put right.
+def _trials(recording: Recording, numbers: set[int]) -> list[Trial]:
+    """Return findings on possible confusions, each with the recording put right.
 
     numbers: numbers of the frames to try.
     """
-    selected = {name: [f for f in frames[name] if f.number in numbers] for name in names}
-    out = []
+    names = recording.fluoroscopes
+    selected = recording.selected(numbers)
+    out: list[tuple[Finding, dict[str, list[Frame]]]] = []
     for one, other in pairwise(names):
         if _size(selected[one]) == _size(selected[other]):
             exchanged = {
@@ -388,7 +348,7 @@ def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Tri
             out.append((Finding(Kind.FLUOROSCOPES_INTERCHANGED, cause), exchanged))
     for name in names[1:]:
         for step, direction in ((1, 'small'), (-1, 'large')):
-            numbered = [replace(f, number=f.number + step) for f in frames[name]]
+            numbered = [replace(f, number=f.number + step) for f in recording.frames[name]]
             numbered = [f for f in numbered if f.number in numbers]
             labelled = [replace(f, target_id=f.target_id + step) for f in selected[name]]
             for kind, label, corrected in (
@@ -399,10 +359,13 @@ def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Tri
                 out.append(
                     (Finding(kind, cause, numbers={'shift': -step}), {**selected, name: corrected})
                 )
-    return out + _other_axes(selected)
+    out += _other_axes(selected)
+    return [(cause, recording.with_frames(frames)) for cause, frames in out]
 
 
-def _other_axes(frames: Mapping[str, list[Frame]]) -> list[Trial]:
+def _other_axes(
+    frames: Mapping[str, list[Frame]],
+) -> list[tuple[Finding, dict[str, list[Frame]]]]:
     """Return trials of other directions of u and v, in all fluoroscopes or in one."""
     out = []
     for kind, cause, change in (

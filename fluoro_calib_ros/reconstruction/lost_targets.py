@@ -16,42 +16,35 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.fluoroscope_calibration import Calibrations
-from ..exposures.frame import Frame, Frames
-from ..exposures.pairing import RecordedPairing
+from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Place, Severity
 from .epipolar import BETTER, MAX_REJECTED, MAX_TRIED, MIN_POINTS
-from .intersection import FAILED, OK, OUTSIDE, REJECTED, Intersector
-from .reconstruct import ReconstructedFrame, numbered_by_exposure, reconstruct_recording
+from .intersection import FAILED, OK, OUTSIDE, REJECTED
+from .reconstruct import ReconstructedFrame, Recording
 
 MAX_PAIRED = 8  # targets of which each pair is tried: 28 pairs
 
 
 def lost_targets(
-    reconstruction: Sequence[ReconstructedFrame],
-    frames: Frames,
-    calibrations: Calibrations,
-    intersector: Intersector,
-    pairing: RecordedPairing,
+    recording: Recording, reconstruction: Sequence[ReconstructedFrame]
 ) -> list[Finding]:
     """Return findings on targets that are rejected in most of their exposures.
 
     Pairs that are exchanged in one fluoroscope come first. Two fluoroscopes do not show in which.
     """
-    names = intersector.orientation.fluoroscopes
     lost = _lost(reconstruction)
-    frames = numbered_by_exposure(frames, names, pairing) if len(lost) > 1 else frames
+    if len(lost) > 1:
+        recording = recording.numbered()
     findings = []
     for pair in combinations(lost[:MAX_PAIRED], 2):
         if not set(pair) <= set(lost):
             continue
         numbers = _exposures_of(reconstruction, pair)
-        some = {name: [f for f in frames[name] if f.number in numbers] for name in names}
+        some = recording.selected(numbers)
         fitting = []
-        for name in names:
+        for name in recording.fluoroscopes:
             changed = {**some, name: [_exchanged(frame, pair) for frame in some[name]]}
-            found, _ = reconstruct_recording(changed, calibrations, intersector, pairing)
-            rejected, total = _counts(found, pair)
+            rejected, total = _counts(recording.with_frames(changed).reconstruct(), pair)
             if total.all() and (rejected < BETTER * total).all():
                 fitting.append(name)
         if fitting:

@@ -23,14 +23,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
-from ..exposures.frame import Frame, Frames
-from ..exposures.pairing import RecordedPairing
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Severity
 from ..photogrammetry.noise import CERTAIN, MEDIAN_SD, NORMAL_MEDIAN, SURE, trimmed_scale
-from ..photogrammetry.rig_orientation import RigOrientation
 from .epipolar import EpipolarGeometry
-from .reconstruct import corrected_view, match_views, pair_recording
+from .reconstruct import Recording, match_views
 
 MAX_PAIRS = 200  # pairs of consecutive exposures, evenly spread over a recording
 MIN_DIFFERENCES = 30
@@ -52,42 +50,40 @@ class _Residuals(NamedTuple):
 
 
 def with_observed_noise(
-    frames: Frames,
-    calibrations: Calibrations,
-    orientation: RigOrientation,
-    pairing: RecordedPairing | None = None,
-    must_explain: bool = True,
-) -> tuple[Frames, Finding | None]:
+    recording: Recording, must_explain: bool = True
+) -> tuple[Recording, Finding | None]:
     """Assign to the image points of a recording the noise that their rays show.
 
     must_explain: False if rays may also miss each other for another reason, such as a change of
-    the rig. Returns the frames with sigma, and a finding on it. Returns the given frames and None
-    if any have sigma, if they scatter as the calibration says, or if the noise cannot be
+    the rig. Returns the recording with sigma, and a finding on it. Returns the given recording and
+    None if any have sigma, if they scatter as the calibration says, or if the noise cannot be
     determined. Raises DataError for frames that cannot be corrected.
     """
-    names = orientation.fluoroscopes
-    given_frames = [frame for name in names for frame in frames.get(name, ())]
+    names = recording.fluoroscopes
+    given_frames = [frame for name in names for frame in recording.frames.get(name, ())]
     if any(frame.sigma is not None for frame in given_frames):
-        return frames, None
-    exposures, _ = pair_recording(frames, names, pairing or RecordedPairing())
+        return recording, None
+    exposures = recording.exposures
     if len(exposures) < 2:
-        return frames, None
+        return recording, None
     count = min(MAX_PAIRS, len(exposures) - 1)
     starts = np.unique(np.linspace(0, len(exposures) - 2, count).astype(int)).tolist()
     rows = {*starts, *(start + 1 for start in starts)}
-    residuals = {row: _residuals(exposures[row], calibrations, orientation) for row in rows}
+    residuals = {row: _residuals(exposures[row], recording) for row in rows}
     factor = _factor([(residuals[start], residuals[start + 1]) for start in starts])
     if factor < MIN_FACTOR or (must_explain and not _explains(factor, list(residuals.values()))):
-        return frames, None
+        return recording, None
+    calibrations = recording.calibrations
     changed = {
         name: [
             replace(frame, sigma=factor * calibrations[name].image_sd_at(frame.uv))
             for frame in view_frames
         ]
-        for name, view_frames in frames.items()
+        for name, view_frames in recording.frames.items()
         if name in names
     }
-    return {**frames, **changed}, _finding(factor, [calibrations[name] for name in names])
+    finding = _finding(factor, [calibrations[name] for name in names])
+    return recording.with_frames({**recording.frames, **changed}), finding
 
 
 def _finding(factor: float, calibrations: Sequence[FluoroscopeCalibration]) -> Finding:
@@ -132,25 +128,20 @@ def _differences(one: _Residuals, other: _Residuals) -> NDArray[np.float64]:
     return np.asarray(np.abs(one.value[i] - other.value[j]) / sd)
 
 
-def _residuals(
-    exposure: Mapping[str, Frame], calibrations: Calibrations, orientation: RigOrientation
-) -> _Residuals:
+def _residuals(exposure: Mapping[str, Frame], recording: Recording) -> _Residuals:
     """Return the epipolar residuals of all pairs of views within the calibrated areas."""
-    names = orientation.fluoroscopes
+    names = recording.fluoroscopes
     views = match_views(
-        [
-            corrected_view(exposure[name], calibrations[name]) if name in exposure else None
-            for name in names
-        ]
+        [recording.corrected(exposure[name]) if name in exposure else None for name in names]
     )
     noise = np.sqrt(np.maximum(views.sigma**2 - views.correction_sd**2, 0.0))
-    widths = [calibrations[name].image_size[0] for name in names]
+    widths = [recording.calibrations[name].image_size[0] for name in names]
     parts = []
     for number, (a, b) in enumerate(combinations(range(len(names)), 2)):
         rows = np.flatnonzero(
             np.isfinite(views.uv[[a, b]]).all(axis=(0, 2)) & ~views.outside[[a, b]].any(axis=0)
         )
-        geometry = EpipolarGeometry(orientation, names[a], names[b])
+        geometry = EpipolarGeometry(recording.orientation, names[a], names[b])
         uv = views.uv[a, rows], views.uv[b, rows]
         by_noise = geometry.residuals(*uv, noise[a, rows], noise[b, rows])
         by_total = geometry.residuals(*uv, views.sigma[a, rows], views.sigma[b, rows])

@@ -9,8 +9,9 @@ both yield the same numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -130,9 +131,19 @@ class ReconstructedFrame:
     #: number and stamp of the frame of its first fluoroscope
     number: int
     stamp_ns: int
-    target_id: NDArray[np.int64]  #: (n,)
-    points: IntersectedPoints
+    intersected: IntersectedViews
     fluoroscopes: tuple[str, ...]  #: fluoroscopes with a frame of the exposure
+    orientation: RigOrientation  #: with the covariance widened after a drift alarm
+
+    @property
+    def target_id(self) -> NDArray[np.integer]:
+        """Target ids (n,) of the points."""
+        return self.intersected.target_id
+
+    @property
+    def points(self) -> IntersectedPoints:
+        """The points in space."""
+        return self.intersected.points
 
 
 def intersect_exposure(
@@ -183,39 +194,23 @@ def reconstruct_exposure(
     examines the exposure. scatter: scatter of the recording so far. Raises DataError for an image
     whose size differs from that of the calibration, and for a repeated target.
     """
-    intersected, available = intersect_frames(exposure, calibrations, intersector, scatter, watch)
-    return ReconstructedFrame(
-        available[0].number,
-        available[0].stamp_ns,
-        intersected.target_id,
-        intersected.points,
-        tuple(frame.fluoroscope for frame in available),
-    )
-
-
-def intersect_frames(
-    exposure: Mapping[str, Frame],
-    calibrations: Calibrations,
-    intersector: Intersector,
-    scatter: ObservedScatter | None = None,
-    watch: ExposureWatch | None = None,
-) -> tuple[IntersectedViews, list[Frame]]:
-    """Correct, match and intersect the frames of an exposure; see `reconstruct_exposure`.
-
-    Also returns the available frames, in the order of the orientation.
-    """
     frames = [exposure.get(name) for name in intersector.orientation.fluoroscopes]
     views = [
         None if frame is None else corrected_view(frame, calibrations[frame.fluoroscope])
         for frame in frames
     ]
     available = [frame for frame in frames if frame is not None]
-    if watch is None:
-        return intersect_exposure(views, intersector, scatter), available
-    widened, image_sd = watch.widened(intersector)
+    widened, image_sd = (intersector, 0.0) if watch is None else watch.widened(intersector)
     intersected = intersect_exposure(views, widened, scatter, image_sd)
-    watch_exposure(watch, available[0].stamp_ns, intersected)
-    return intersected, available
+    if watch is not None:
+        watch_exposure(watch, available[0].stamp_ns, intersected)
+    return ReconstructedFrame(
+        available[0].number,
+        available[0].stamp_ns,
+        intersected,
+        fluoroscopes=tuple(frame.fluoroscope for frame in available),
+        orientation=widened.orientation,
+    )
 
 
 def corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> CorrectedView:
@@ -229,55 +224,112 @@ def corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> Correct
     return CorrectedView.of_columns(frame.target_id, columns)
 
 
-def reconstruct_recording(
-    frames: Frames,
-    calibrations: Calibrations,
-    intersector: Intersector,
-    pairing: RecordedPairing | None = None,
-    watch: ExposureWatch | None = None,
-    scatter: ObservedScatter | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[list[ReconstructedFrame], dict[str, int]]:
-    """Reconstruct the exposures of a recording.
+@dataclass(frozen=True)
+class Recording:
+    """Observed frames of a recording by fluoroscope, and the rig that took them.
 
-    Parameters
-    ----------
-    frames : mapping of str to sequence of Frame
-        Observed frames by fluoroscope.
-    calibrations : mapping of str to FluoroscopeCalibration
-    intersector : Intersector
-        With three or more fluoroscopes, some views of an exposure may be missing.
-    pairing : RecordedPairing, optional
-        Criterion by which frames belong to an exposure; by default their number.
-    watch : ExposureWatch, optional
-        Examines the exposures.
-    scatter : ObservedScatter, optional
-        Learns the scatter of the recording, and widens the limit of false matches accordingly. By
-        default a new one is created.
-    progress : callable, optional
-        Called with the number of reconstructed exposures, and their total number.
-
-    Returns
-    -------
-    frames : list of ReconstructedFrame
-        In temporal order.
-    unpaired : dict of str to int
-        Number of frames without partners, by fluoroscope.
-
-    Raises
-    ------
-    DataError
-        As reconstruct_exposure, and if a fluoroscope of the rig has no frames.
+    With three or more fluoroscopes, some views of an exposure may be missing. Properties and
+    methods raise DataError if a fluoroscope of the rig has no frames.
     """
-    names = intersector.orientation.fluoroscopes
-    exposures, unpaired = pair_recording(frames, names, pairing or RecordedPairing())
-    scatter = scatter or ObservedScatter()
-    out = []
-    for count, exposure in enumerate(exposures, 1):
-        out.append(reconstruct_exposure(exposure, calibrations, intersector, watch, scatter))
-        if progress is not None:
-            progress(count, len(exposures))
-    return out, unpaired
+
+    frames: Frames
+    calibrations: Calibrations
+    intersector: Intersector
+    #: criterion by which frames belong to an exposure
+    pairing: RecordedPairing = field(default_factory=RecordedPairing)
+
+    @property
+    def orientation(self) -> RigOrientation:
+        """Orientation of the fluoroscopes that are used."""
+        return self.intersector.orientation
+
+    @property
+    def fluoroscopes(self) -> tuple[str, ...]:
+        """Fluoroscopes that are used."""
+        return self.orientation.fluoroscopes
+
+    @property
+    def exposures(self) -> list[dict[str, Frame]]:
+        """Frames of each exposure by fluoroscope, in temporal order."""
+        return self._paired[0]
+
+    @property
+    def unpaired(self) -> dict[str, int]:
+        """Number of frames without partners, by fluoroscope."""
+        return self._paired[1]
+
+    @cached_property
+    def _paired(self) -> tuple[list[dict[str, Frame]], dict[str, int]]:
+        for name in self.fluoroscopes:
+            if name not in self.frames:
+                raise DataError(
+                    f'there are no frames of fluoroscope {name}, only of {", ".join(self.frames)}'
+                )
+        pairer = exposure_pairer(self.fluoroscopes, self.pairing.unlimited())
+        exposures = list(
+            recorded_exposures(pairer, [self.frames[name] for name in self.fluoroscopes])
+        )
+        return exposures, dict(pairer.unpaired)
+
+    def with_frames(self, frames: Frames) -> Recording:
+        """Return a recording of the same rig with other frames."""
+        return replace(self, frames=frames)
+
+    def numbered(self) -> Recording:
+        """Return the recording with the numbers of its exposures, see ReconstructedFrame.
+
+        Frames that are paired by stamp may be numbered differently, or not at all.
+        """
+        if self.pairing.pair_by == 'frame_number':
+            return self
+        names = self.fluoroscopes
+        return self.with_frames(
+            {name: [frame[name] for frame in self.exposures if name in frame] for name in names}
+        )
+
+    def selected(self, numbers: Container[int]) -> dict[str, list[Frame]]:
+        """Return the frames with some numbers, by fluoroscope."""
+        return {
+            name: [frame for frame in self.frames[name] if frame.number in numbers]
+            for name in self.fluoroscopes
+        }
+
+    def corrected(self, frame: Frame) -> CorrectedView:
+        """Return the corrected view of a frame. Raises DataError, as `corrected_view` does."""
+        return corrected_view(frame, self.calibrations[frame.fluoroscope])
+
+    def reconstruct(
+        self,
+        watch: ExposureWatch | None = None,
+        scatter: ObservedScatter | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> list[ReconstructedFrame]:
+        """Return the points of the exposures, in temporal order.
+
+        Parameters
+        ----------
+        watch : ExposureWatch, optional
+            Examines the exposures.
+        scatter : ObservedScatter, optional
+            Learns the scatter of the recording, and widens the limit of false matches
+            accordingly. By default a new one is created.
+        progress : callable, optional
+            Called with the number of reconstructed exposures, and their total number.
+
+        Raises
+        ------
+        DataError
+            As `reconstruct_exposure`.
+        """
+        scatter = scatter or ObservedScatter()
+        out = []
+        for count, exposure in enumerate(self.exposures, 1):
+            out.append(
+                reconstruct_exposure(exposure, self.calibrations, self.intersector, watch, scatter)
+            )
+            if progress is not None:
+                progress(count, len(self.exposures))
+        return out
 
 
 def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigOrientation:
@@ -289,32 +341,3 @@ def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigO
             f'the orientation ({", ".join(orientation.fluoroscopes)}) are needed'
         )
     return orientation.subset(names)
-
-
-def numbered_by_exposure(frames: Frames, names: Sequence[str], pairing: RecordedPairing) -> Frames:
-    """Return the frames of a recording with the numbers of its exposures, see ReconstructedFrame.
-
-    Frames that are paired by stamp may be numbered differently, or not at all.
-    """
-    if pairing.pair_by == 'frame_number':
-        return frames
-    exposures, _ = pair_recording(frames, names, pairing)
-    return {name: [frame[name] for frame in exposures if name in frame] for name in names}
-
-
-def pair_recording(
-    frames: Frames, names: Sequence[str], pairing: RecordedPairing
-) -> tuple[list[dict[str, Frame]], dict[str, int]]:
-    """Pair the frames of a recording into exposures, in temporal order.
-
-    Also returns the number of frames without partners by fluoroscope. Raises DataError if a
-    fluoroscope has no frames.
-    """
-    for name in names:
-        if name not in frames:
-            raise DataError(
-                f'there are no frames of fluoroscope {name}, only of {", ".join(frames)}'
-            )
-    pairer = exposure_pairer(names, pairing.unlimited())
-    exposures = list(recorded_exposures(pairer, [frames[name] for name in names]))
-    return exposures, dict(pairer.unpaired)

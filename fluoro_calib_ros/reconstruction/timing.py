@@ -21,15 +21,13 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.fluoroscope_calibration import Calibrations
-from ..exposures.frame import Frame
 from ..exposures.stamps import NS_PER_S
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..rows import chosen_rows, joined_rows
 from .epipolar import RECENT, EpipolarGeometry, RecentMisses
 from .intersection import IntersectedPoints
-from .reconstruct import CorrectedView, corrected_view, match_views
+from .reconstruct import CorrectedView, Recording, match_views
 
 MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
 MIN_SIGMAS = 5.0  # minimum delay over its standard deviation: one in a million by chance
@@ -125,17 +123,9 @@ class RecentExposures(Generic[AnyFrame]):
         return self._misses.finding(timing), timing
 
 
-def timing_of_recording(
-    exposures: Sequence[Mapping[str, Frame]],
-    calibrations: Calibrations,
-    orientation: RigOrientation,
-) -> Finding | None:
-    """Return the fault of the timing of paired frames, or None; see `timing_fault`."""
-    return timing_fault(
-        exposures,
-        lambda frame: corrected_view(frame, calibrations[frame.fluoroscope]),
-        orientation,
-    )
+def timing_of_recording(recording: Recording) -> Finding | None:
+    """Return the fault of the timing of a recording, or None; see `timing_fault`."""
+    return timing_fault(recording.exposures, recording.corrected, recording.orientation)
 
 
 @dataclass(frozen=True)

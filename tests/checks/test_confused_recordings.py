@@ -26,7 +26,6 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.estimation.rig_orientation import orientation_and_scatter
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
@@ -50,7 +49,7 @@ from fluoro_calib_ros.reconstruction.intersection import (
     SINGLE_VIEW,
     Intersector,
 )
-from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
+from fluoro_calib_ros.reconstruction.reconstruct import Recording
 from fluoro_calib_ros.report import html as html_report
 from fluoro_calib_ros.simulation.rig import Detection, detect_beads, phantom_poses, virtual_rig
 
@@ -375,16 +374,14 @@ def test_rays_that_do_not_meet_are_refused_with_their_cause(case):
 @pytest.mark.parametrize('field', ['number', 'target_id'])
 def test_shift_that_is_found_is_the_one_that_was_made(field, step):
     shifted = changed(lambda f: replace(f, **{field: getattr(f, field) + step}), 'b')
-    found = reconstruct_recording(
-        shifted, calibrations(), Intersector(orientation()), RecordedPairing()
-    )[0]
-    given = (found, shifted, calibrations(), Intersector(orientation()), RecordedPairing())
-    why = mismatch(*given)
+    recording = Recording(shifted, calibrations(), Intersector(orientation()))
+    found = recording.reconstruct()
+    why = mismatch(recording, found)
     assert why.kind is (Kind.FRAMES_SHIFTED if field == 'number' else Kind.IDS_SHIFTED)
     assert why.numbers['shift'] == step
     share, total = share_rejected(found)
     assert why.numbers['share'] == share > 0.5 and total >= 20
-    assert cause_of_misses(*given).kind is why.kind
+    assert cause_of_misses(recording, found).kind is why.kind
 
 
 def by_stamp(of, first):
@@ -504,8 +501,7 @@ def test_targets_that_are_rejected_throughout_are_named():
 
 def test_a_stream_whose_rays_miss_each_other_is_noticed_and_forgotten():
     def of(some):
-        found, _ = reconstruct_recording(some, calibrations(), Intersector(orientation()))
-        return found
+        return Recording(some, calibrations(), Intersector(orientation())).reconstruct()
 
     misses = RecentMisses()
     assert misses.finding() is None

@@ -16,7 +16,9 @@ from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.jobs.bodies import track_bodies
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.observed_noise import with_observed_noise
+from fluoro_calib_ros.reconstruction.reconstruct import Recording
 from fluoro_calib_ros.simulation.rig import (
     StreamStart,
     image_frames,
@@ -42,8 +44,13 @@ def tracking(noise_px, names='ab', seconds=1.0):
 
 
 def observed(frames, names='ab', **options):
-    _, calibrations, orientation = rig(names)
-    return with_observed_noise(frames, calibrations, orientation, **options)
+    return of_rig(frames, *rig(names)[1:], **options)
+
+
+def of_rig(frames, calibrations, orientation, **options):
+    recording = Recording(frames, calibrations, Intersector(orientation))
+    noisy, finding = with_observed_noise(recording, **options)
+    return noisy.frames, finding
 
 
 def turned(orientation, degrees):
@@ -105,10 +112,10 @@ def test_what_is_no_noise_is_not_taken_for_it():
     _, calibrations, orientation = rig('ab')
     knocked = turned(orientation, 0.5)
     precise = tracking(BEADS_PX).frames
-    assert with_observed_noise(precise, calibrations, knocked)[1] is None
+    assert of_rig(precise, calibrations, knocked)[1] is None
     noisy = tracking(0.4).frames
-    assert with_observed_noise(noisy, calibrations, knocked)[1] is None
-    found = with_observed_noise(noisy, calibrations, knocked, must_explain=False)[1]
+    assert of_rig(noisy, calibrations, knocked)[1] is None
+    found = of_rig(noisy, calibrations, knocked, must_explain=False)[1]
     assert found.numbers['noise_px'] == pytest.approx(0.4, rel=0.08)
     shifted = {**precise, 'b': [replace(f, target_id=f.target_id + 1) for f in precise['b']]}
     assert observed(shifted)[1] is None
@@ -168,4 +175,4 @@ def test_residuals_of_different_views_are_not_compared():
             covariance=np.diag(sd**2),
         )
         for given in (frames, some):
-            assert with_observed_noise(given, calibrations, moved)[1] is None
+            assert of_rig(given, calibrations, moved)[1] is None

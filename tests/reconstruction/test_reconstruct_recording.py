@@ -23,9 +23,9 @@ from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (
     CorrectedView,
+    Recording,
     intersect_exposure,
     match_views,
-    reconstruct_recording,
     watch_exposure,
 )
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
@@ -81,7 +81,7 @@ def watched(frames, names, clusters=(), options=DriftOptions()):
         options,
         declared_bodies(clusters),
     )
-    reconstruct_recording(frames, calibrations, Intersector(orientation), watch=watch)
+    Recording(frames, calibrations, Intersector(orientation)).reconstruct(watch)
     return watch
 
 
@@ -117,12 +117,12 @@ def test_without_a_view_the_points_are_those_of_the_other_two(missing):
     calibrations, orientation = known()
     frames = tracking(0.5, 40).frames
     others = [name for name in 'abc' if name != missing]
-    whole, _ = reconstruct_recording(frames, calibrations, Intersector(orientation))
-    two, _ = reconstruct_recording(frames, calibrations, Intersector(orientation.subset(others)))
+    recording = Recording(frames, calibrations, Intersector(orientation))
+    whole = recording.reconstruct()
+    two = replace(recording, intersector=Intersector(orientation.subset(others))).reconstruct()
     kept = [f for f in frames[missing] if f.number % 2]
-    found, unpaired = reconstruct_recording(
-        {**frames, missing: kept}, calibrations, Intersector(orientation)
-    )
+    partial = recording.with_frames({**frames, missing: kept})
+    found, unpaired = partial.reconstruct(), partial.unpaired
     assert [f.number for f in found] == [f.number for f in whole] and not any(unpaired.values())
     for frame, of_three, of_two in zip(found, whole, two):
         same = of_three if frame.number % 2 else of_two
@@ -163,9 +163,8 @@ def test_every_exposure_of_two_views_is_reconstructed(by, seed):
             ]
             for k, (name, of_one) in enumerate(kept.items())
         }
-    found, unpaired = reconstruct_recording(
-        kept, calibrations, Intersector(orientation), RecordedPairing(by)
-    )
+    recording = Recording(kept, calibrations, Intersector(orientation), RecordedPairing(by))
+    found, unpaired = recording.reconstruct(), recording.unpaired
     views = np.sum(list(there.values()), axis=0)
     rows = np.flatnonzero(views >= 2)
     start = frames['a'][0].stamp_ns
@@ -180,9 +179,8 @@ def test_a_target_in_one_view_of_two_has_the_status_single_view():
     frames = {name: of_one[:1] for name, of_one in tracking(0.5, 40).frames.items() if name != 'c'}
     one = frames['a'][0]
     frames['a'] = [replace(one, target_id=one.target_id[3:], uv=one.uv[3:])]
-    (found,), _ = reconstruct_recording(
-        {**frames, 'c': []}, calibrations, Intersector(orientation)
-    )
+    recording = Recording({**frames, 'c': []}, calibrations, Intersector(orientation))
+    (found,) = recording.reconstruct()
     assert found.points.status.tolist() == 3 * [SINGLE_VIEW] + 21 * [OK]
 
 
@@ -240,7 +238,7 @@ def test_the_state_is_that_of_a_watch_fed_frame_by_frame():
     calibrations, orientation = known('ab')
     frames, watch = drifted()
     live = RigDriftWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
-    reconstruct_recording(frames, calibrations, Intersector(orientation), watch=live)
+    Recording(frames, calibrations, Intersector(orientation)).reconstruct(live)
     assert live.state == watch.state and live.state.level == ERROR
 
 

@@ -12,14 +12,12 @@ from rigs import refused, true_calibrations, true_orientation
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.jobs.reconstruction import reconstruct
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (
+    Recording,
     corrected_view,
-    pair_recording,
-    reconstruct_recording,
 )
 from fluoro_calib_ros.reconstruction.timing import (
     KEPT,
@@ -66,8 +64,8 @@ def recorded(steps, names='ab', seed=4, seconds=2.0, rate_hz=RATE_HZ):
 
 def found(frames, names='ab', orientation=None):
     calibrations, known_orientation = known(names)
-    exposures, _ = pair_recording(frames, list(names), RecordedPairing())
-    return timing_of_recording(exposures, calibrations, orientation or known_orientation)
+    intersector = Intersector((orientation or known_orientation).subset(list(names)))
+    return timing_of_recording(Recording(frames, calibrations, intersector))
 
 
 @pytest.mark.parametrize('names', ['ab', 'abc'])
@@ -177,9 +175,9 @@ def test_points_without_noise_are_judged():
         name: [replace(f, sigma=np.full(len(f.uv), 1e-12)) for f in frames]
         for name, frames in recorded(2).items()
     }
-    exposures, _ = pair_recording(exact, 'ab', RecordedPairing())
+    recording = Recording(exact, calibrations, Intersector(orientation))
     with np.errstate(all='raise'):
-        timing_of_recording(exposures, calibrations, orientation)
+        timing_of_recording(recording)
 
 
 def test_points_at_rest_and_short_recordings_tell_nothing():
@@ -201,16 +199,15 @@ def test_a_stream_is_judged_if_its_rays_miss():
     calibrations, orientation = known()
     recent = RecentExposures(lambda frame: corrected_view(frame, calibrations[frame.fluoroscope]))
     frames = recorded(2, seconds=12.0, rate_hz=5.0)
-    points, _ = reconstruct_recording(frames, calibrations, Intersector(orientation))
-    exposures, _ = pair_recording(frames, 'ab', RecordedPairing())
-    for exposure, frame in zip(exposures, points, strict=True):
+    recording = Recording(frames, calibrations, Intersector(orientation))
+    for exposure, frame in zip(recording.exposures, recording.reconstruct(), strict=True):
         recent.add(exposure, frame.points)
     misses, timing = recent.faults(orientation, is_doubtful=False)
     assert misses.kind is timing.kind is Kind.FRAMES_DELAYED and misses.numbers['share'] > 0.5
     slow = RecentExposures(lambda frame: corrected_view(frame, calibrations[frame.fluoroscope]))
     frames = recorded(2)
-    points, _ = reconstruct_recording(frames, calibrations, Intersector(orientation))
-    for exposure, frame in zip(pair_recording(frames, 'ab', RecordedPairing())[0], points):
+    recording = Recording(frames, calibrations, Intersector(orientation))
+    for exposure, frame in zip(recording.exposures, recording.reconstruct()):
         slow.add(exposure, frame.points)
     assert slow.faults(orientation, is_doubtful=False) == (None, None)
     assert slow.faults(orientation, is_doubtful=True)[1].kind is Kind.FRAMES_DELAYED

@@ -29,7 +29,7 @@ from fluoro_calib_ros.estimation.rig_orientation import (
 )
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.reconstruct import ReconstructedFrame, Recording
+from fluoro_calib_ros.reconstruction.reconstruct import ReconstructedFrame, RigRecording
 from fluoro_calib_ros.simulation.rig import (
     Detection,
     VirtualRig,
@@ -155,7 +155,7 @@ def measure(
                 orientation_and_scatter(training, rig.phantom, calibrations)[0],
             ),
         ):
-            found = Recording(moving, calibrations, Intersector(orientation)).reconstruct()
+            found = RigRecording(moving, calibrations, Intersector(orientation)).reconstruct()
             out[label] = _outcome(found, tracking.points_mm, orientation.source == 'capture')
     return out
 

@@ -69,7 +69,7 @@ from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 from fluoro_calib_ros.reconstruction import epipolar, lost_targets, observed_noise
-from fluoro_calib_ros.reconstruction.reconstruct import Recording
+from fluoro_calib_ros.reconstruction.reconstruct import RigRecording
 from fluoro_calib_ros.reconstruction.timing import (
     Delay,
     Motion,
@@ -231,7 +231,7 @@ def trial(kind):
     """Return the finding on missing rays for the confusion that a trial reconstruction reports."""
     both = {name: list(of_one[:2]) for name, of_one in exposures().items()}
     rig = Fake(orientation=Fake(fluoroscopes='ab'))
-    found = [why for why, _ in epipolar._trials(Recording(both, {}, rig), {1, 2})]
+    found = [why for why, _ in epipolar._trials(RigRecording(both, {}, rig), {1, 2})]
     return epipolar.missing_rays(0.9, next(one for one in found if one.kind is kind))
 
 

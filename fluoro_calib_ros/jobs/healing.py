@@ -53,7 +53,7 @@ from ..io.versions import HEALING, LEARNED_SHAPES, write_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
-from ..reconstruction.reconstruct import Recording, orientation_of_recorded
+from ..reconstruction.reconstruct import RigRecording, orientation_of_recorded
 from ..reconstruction.timing import timing_of_recording
 
 BLOCKS = 10  # blocks of a recording, alternately used for the diagnosis and for its verdict
@@ -217,7 +217,7 @@ def _exposures_of(
     """Return the exposures that show bodies, and a finding on their noise. Raises DataError."""
     markers = np.concatenate([body.target_id for body in bodies])
     recording, noise = with_observed_noise(
-        Recording(
+        RigRecording(
             frames_of_targets(frames, markers), calibrations, Intersector(orientation), options
         ),
         must_explain=False,

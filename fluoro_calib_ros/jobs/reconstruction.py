@@ -30,7 +30,7 @@ from ..reconstruction.lost_targets import lost_targets
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import (
     ReconstructedFrame,
-    Recording,
+    RigRecording,
     orientation_of_recorded,
 )
 from ..reconstruction.timing import timing_of_recording
@@ -148,7 +148,7 @@ def reconstructed_rays(
     orientation: RigOrientation,
     options: ReconstructionOptions,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[ReconstructionOutcome, Recording]:
+) -> tuple[ReconstructionOutcome, RigRecording]:
     """Reconstruct a recording as `reconstruct` does, without a search for lost targets.
 
     Also returns the recording with the observed noise.
@@ -161,7 +161,7 @@ def reconstructed_rays(
     check_orientation(orientation, calibrations)
     names = orientation.fluoroscopes
     recording, noise = with_observed_noise(
-        Recording(frames, calibrations, Intersector(orientation, options.reject), options)
+        RigRecording(frames, calibrations, Intersector(orientation, options.reject), options)
     )
     watch, drift = _drift_watch(orientation, calibrations, options)
     scatter = ObservedScatter()

@@ -41,7 +41,7 @@ from .intersection import (
     STATUS_NAMES,
     IntersectedPoints,
 )
-from .reconstruct import ReconstructedFrame, Recording
+from .reconstruct import ReconstructedFrame, RigRecording
 
 MIN_BASE = 1e-6  # minimum distance of the sources over their distance from the origin of the rig
 
@@ -204,7 +204,7 @@ BETTER = 0.3
 CLOSER = 0.6
 
 
-Trial = tuple[Finding, Recording]
+Trial = tuple[Finding, RigRecording]
 
 
 class RecentMisses:
@@ -253,7 +253,7 @@ def _counts(status: NDArray[np.integer]) -> tuple[int, int, int]:
 
 
 def why_rays_miss(
-    recording: Recording,
+    recording: RigRecording,
     reconstruction: Sequence[ReconstructedFrame],
     widening: float,
     timing: Finding | None = None,
@@ -274,7 +274,9 @@ def why_rays_miss(
     return finding
 
 
-def mismatch(recording: Recording, reconstruction: Sequence[ReconstructedFrame]) -> Finding | None:
+def mismatch(
+    recording: RigRecording, reconstruction: Sequence[ReconstructedFrame]
+) -> Finding | None:
     """Return why most rays miss each other, or None if most meet."""
     share, total = share_rejected(reconstruction)
     seen = sum(len(frame.target_id) for frame in reconstruction)
@@ -290,7 +292,7 @@ def mismatch(recording: Recording, reconstruction: Sequence[ReconstructedFrame])
 
 
 def cause_of_misses(
-    recording: Recording, reconstruction: Sequence[ReconstructedFrame]
+    recording: RigRecording, reconstruction: Sequence[ReconstructedFrame]
 ) -> Finding | None:
     """Return why rays miss each other by more than expected, or None if no trial identifies it.
 
@@ -329,7 +331,7 @@ def _miss(reconstructed: Sequence[ReconstructedFrame]) -> float:
     return float(np.median(np.where(np.isfinite(size), size, np.inf)))
 
 
-def _trials(recording: Recording, numbers: set[int]) -> list[Trial]:
+def _trials(recording: RigRecording, numbers: set[int]) -> list[Trial]:
     """Return findings on possible confusions, each with the recording put right.
 
     numbers: numbers of the frames to try.

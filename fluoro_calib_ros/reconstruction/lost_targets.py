@@ -20,13 +20,13 @@ from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Place, Severity
 from .epipolar import BETTER, MAX_REJECTED, MAX_TRIED, MIN_POINTS
 from .intersection import FAILED, OK, OUTSIDE, REJECTED
-from .reconstruct import ReconstructedFrame, Recording
+from .reconstruct import ReconstructedFrame, RigRecording
 
 MAX_PAIRED = 8  # targets of which each pair is tried: 28 pairs
 
 
 def lost_targets(
-    recording: Recording, reconstruction: Sequence[ReconstructedFrame]
+    recording: RigRecording, reconstruction: Sequence[ReconstructedFrame]
 ) -> list[Finding]:
     """Return findings on targets that are rejected in most of their exposures.
 

@@ -28,7 +28,7 @@ from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Severity
 from ..photogrammetry.noise import CERTAIN, MEDIAN_SD, NORMAL_MEDIAN, SURE, trimmed_scale
 from .epipolar import EpipolarGeometry
-from .reconstruct import Recording, match_views
+from .reconstruct import RigRecording, match_views
 
 MAX_PAIRS = 200  # pairs of consecutive exposures, evenly spread over a recording
 MIN_DIFFERENCES = 30
@@ -50,8 +50,8 @@ class _Residuals(NamedTuple):
 
 
 def with_observed_noise(
-    recording: Recording, must_explain: bool = True
-) -> tuple[Recording, Finding | None]:
+    recording: RigRecording, must_explain: bool = True
+) -> tuple[RigRecording, Finding | None]:
     """Assign to the image points of a recording the noise that their rays show.
 
     must_explain: False if rays may also miss each other for another reason, such as a change of
@@ -128,7 +128,7 @@ def _differences(one: _Residuals, other: _Residuals) -> NDArray[np.float64]:
     return np.asarray(np.abs(one.value[i] - other.value[j]) / sd)
 
 
-def _residuals(exposure: Mapping[str, Frame], recording: Recording) -> _Residuals:
+def _residuals(exposure: Mapping[str, Frame], recording: RigRecording) -> _Residuals:
     """Return the epipolar residuals of all pairs of views within the calibrated areas."""
     names = recording.fluoroscopes
     views = match_views(

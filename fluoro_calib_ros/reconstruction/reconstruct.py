@@ -225,7 +225,7 @@ def corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> Correct
 
 
 @dataclass(frozen=True)
-class Recording:
+class RigRecording:
     """Observed frames of a recording by fluoroscope, and the rig that took them.
 
     With three or more fluoroscopes, some views of an exposure may be missing. Properties and
@@ -271,11 +271,11 @@ class Recording:
         )
         return exposures, dict(pairer.unpaired)
 
-    def with_frames(self, frames: Frames) -> Recording:
+    def with_frames(self, frames: Frames) -> RigRecording:
         """Return a recording of the same rig with other frames."""
         return replace(self, frames=frames)
 
-    def numbered(self) -> Recording:
+    def numbered(self) -> RigRecording:
         """Return the recording with the numbers of its exposures, see ReconstructedFrame.
 
         Frames that are paired by stamp may be numbered differently, or not at all.

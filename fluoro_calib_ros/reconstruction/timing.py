@@ -27,7 +27,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..rows import chosen_rows, joined_rows
 from .epipolar import RECENT, EpipolarGeometry, RecentMisses
 from .intersection import IntersectedPoints
-from .reconstruct import CorrectedView, Recording, match_views
+from .reconstruct import CorrectedView, RigRecording, match_views
 
 MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
 MIN_SIGMAS = 5.0  # minimum delay over its standard deviation: one in a million by chance
@@ -123,7 +123,7 @@ class RecentExposures(Generic[AnyFrame]):
         return self._misses.finding(timing), timing
 
 
-def timing_of_recording(recording: Recording) -> Finding | None:
+def timing_of_recording(recording: RigRecording) -> Finding | None:
     """Return the fault of the timing of a recording, or None; see `timing_fault`."""
     return timing_fault(recording.exposures, recording.corrected, recording.orientation)
 

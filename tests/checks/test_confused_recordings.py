@@ -49,7 +49,7 @@ from fluoro_calib_ros.reconstruction.intersection import (
     SINGLE_VIEW,
     Intersector,
 )
-from fluoro_calib_ros.reconstruction.reconstruct import Recording
+from fluoro_calib_ros.reconstruction.reconstruct import RigRecording
 from fluoro_calib_ros.report import html as html_report
 from fluoro_calib_ros.simulation.rig import Detection, detect_beads, phantom_poses, virtual_rig
 
@@ -374,7 +374,7 @@ def test_rays_that_do_not_meet_are_refused_with_their_cause(case):
 @pytest.mark.parametrize('field', ['number', 'target_id'])
 def test_shift_that_is_found_is_the_one_that_was_made(field, step):
     shifted = changed(lambda f: replace(f, **{field: getattr(f, field) + step}), 'b')
-    recording = Recording(shifted, calibrations(), Intersector(orientation()))
+    recording = RigRecording(shifted, calibrations(), Intersector(orientation()))
     found = recording.reconstruct()
     why = mismatch(recording, found)
     assert why.kind is (Kind.FRAMES_SHIFTED if field == 'number' else Kind.IDS_SHIFTED)
@@ -501,7 +501,7 @@ def test_targets_that_are_rejected_throughout_are_named():
 
 def test_a_stream_whose_rays_miss_each_other_is_noticed_and_forgotten():
     def of(some):
-        return Recording(some, calibrations(), Intersector(orientation())).reconstruct()
+        return RigRecording(some, calibrations(), Intersector(orientation())).reconstruct()
 
     misses = RecentMisses()
     assert misses.finding() is None

@@ -23,7 +23,7 @@ from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.reconstruct import Recording, reconstruct_exposure
+from fluoro_calib_ros.reconstruction.reconstruct import RigRecording, reconstruct_exposure
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
@@ -187,7 +187,7 @@ def test_points_of_a_knocked_rig_are_found_with_honest_deviations():
         assert widening.kind is Kind.WIDENED_BY_ALARM
         assert widening.numbers['sd_mm'] > 5 * widening.numbers['sd_before_mm']
     assert 0.2 < np.mean(mean) < 1.5
-    plain = Recording(
+    plain = RigRecording(
         {n: of[alarm:] for n, of in frames.items()}, calibrations, Intersector(orientation)
     ).reconstruct()
     assert np.mean(np.concatenate([frame.points.status for frame in plain]) == 0) < 0.5
@@ -203,7 +203,7 @@ def test_small_drift_widens_points_while_rays_show_it():
         found = reconstruct(frames, calibrations, orientation).frames
         mean.append(squares(found, truth)[late])
         unwatched = {n: of[late] for n, of in frames.items()}
-        found = Recording(unwatched, calibrations, Intersector(orientation)).reconstruct()
+        found = RigRecording(unwatched, calibrations, Intersector(orientation)).reconstruct()
         without.append(squares(found, truth))
     assert 0.2 < np.nanmean(mean) < 1.5
     assert np.nanmean(without) > 10
@@ -247,7 +247,7 @@ def test_without_an_alarm_nothing_is_added():
     calibrations, orientation, frames, _ = scene(0.0)
     watch = RigDriftWatch(orientation, {n: calibrations[n].image_size for n in 'ab'})
     given = Intersector(orientation)
-    recording = Recording(frames, calibrations, given)
+    recording = RigRecording(frames, calibrations, given)
     found = recording.reconstruct(watch)
     plain = recording.reconstruct()
     assert watch.widening is None and watch.widened(given) == (given, 0.0)

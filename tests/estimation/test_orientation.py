@@ -38,7 +38,7 @@ from fluoro_calib_ros.photogrammetry.rig_orientation import (
 )
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from fluoro_calib_ros.reconstruction.intersection import OK, Intersector
-from fluoro_calib_ros.reconstruction.reconstruct import Recording
+from fluoro_calib_ros.reconstruction.reconstruct import RigRecording
 from fluoro_calib_ros.simulation.rig import (
     Detection,
     VirtualRig,
@@ -132,7 +132,7 @@ def test_errors_of_points_after_a_capture_agree_with_their_covariances():
     )
     assert orientation.calibration_ids == tuple(c.calibration_id for c in calibrations().values())
     tracking = simulate_tracking(rig(), 1.0, 40, seed=1)
-    found = Recording(tracking.frames, calibrations(), Intersector(orientation)).reconstruct()
+    found = RigRecording(tracking.frames, calibrations(), Intersector(orientation)).reconstruct()
     error = np.concatenate([frame.points.xyz_mm for frame in found]) - tracking.points_mm.reshape(
         -1, 3
     )
@@ -358,7 +358,7 @@ def test_orientation_of_the_exposures_of_a_calibration():
     tracking = simulate_tracking(rig(), 0.5, 40, seed=2)
     points = [
         f.points
-        for f in Recording(tracking.frames, calibrations(), Intersector(found)).reconstruct()
+        for f in RigRecording(tracking.frames, calibrations(), Intersector(found)).reconstruct()
     ]
     assert np.mean([p.status == OK for p in points]) > 0.99
     assert 0.6 < np.mean([p.standardised**2 for p in points]) < 1.4

@@ -30,7 +30,7 @@ from fluoro_calib_ros.reconstruction.intersection import (
 )
 from fluoro_calib_ros.reconstruction.reconstruct import (
     CorrectedView,
-    Recording,
+    RigRecording,
     match_views,
 )
 from fluoro_calib_ros.simulation.rig import virtual_rig
@@ -610,7 +610,7 @@ def test_recording_frame_by_frame():
     """Observed points are corrected first; frames without a partner are counted."""
     frames, calibrations, intersector, xyz = recording()
     frames['b'] = [replace(frames['b'][0], target_id=np.array([3, 1, 8])), *frames['b'][2:]]
-    by_number = Recording(frames, calibrations, intersector)
+    by_number = RigRecording(frames, calibrations, intersector)
     found = by_number.reconstruct()
     assert [frame.number for frame in found] == [1, 3]
     assert by_number.unpaired == {'a': 1, 'b': 0}
@@ -618,7 +618,7 @@ def test_recording_frame_by_frame():
     assert found[0].points.status.tolist() == [OK, SINGLE_VIEW, OK, SINGLE_VIEW]
     assert np.abs(found[1].points.xyz_mm - xyz).max() < 1.0
     other = {**frames, 'b': [replace(f, number=f.number + 10) for f in frames['b']]}
-    by_time = Recording(other, calibrations, intersector, RecordedPairing('stamp'))
+    by_time = RigRecording(other, calibrations, intersector, RecordedPairing('stamp'))
     again = by_time.reconstruct()
     assert len(again) == 2 and by_time.unpaired == {'a': 1, 'b': 0}
     np.testing.assert_array_equal(again[1].points.xyz_mm, found[1].points.xyz_mm)
@@ -636,9 +636,9 @@ def test_invalid_recordings_are_refused():
     ):
         wrong = {**frames, 'b': [replace(frames['b'][0], **change)]}
         with pytest.raises(DataError, match=sentence):
-            Recording(wrong, calibrations, intersector).reconstruct()
+            RigRecording(wrong, calibrations, intersector).reconstruct()
     with pytest.raises(DataError, match='there are no frames of fluoroscope b, only of a'):
-        Recording({'a': frames['a']}, calibrations, intersector).reconstruct()
+        RigRecording({'a': frames['a']}, calibrations, intersector).reconstruct()
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstr
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.observed_noise import with_observed_noise
-from fluoro_calib_ros.reconstruction.reconstruct import Recording
+from fluoro_calib_ros.reconstruction.reconstruct import RigRecording
 from fluoro_calib_ros.simulation.rig import (
     StreamStart,
     image_frames,
@@ -48,7 +48,7 @@ def observed(frames, names='ab', **options):
 
 
 def of_rig(frames, calibrations, orientation, **options):
-    recording = Recording(frames, calibrations, Intersector(orientation))
+    recording = RigRecording(frames, calibrations, Intersector(orientation))
     noisy, finding = with_observed_noise(recording, **options)
     return noisy.frames, finding
 

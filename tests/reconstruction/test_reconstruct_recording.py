@@ -23,7 +23,7 @@ from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (
     CorrectedView,
-    Recording,
+    RigRecording,
     intersect_exposure,
     match_views,
     watch_exposure,
@@ -81,7 +81,7 @@ def watched(frames, names, clusters=(), options=DriftOptions()):
         options,
         declared_bodies(clusters),
     )
-    Recording(frames, calibrations, Intersector(orientation)).reconstruct(watch)
+    RigRecording(frames, calibrations, Intersector(orientation)).reconstruct(watch)
     return watch
 
 
@@ -117,7 +117,7 @@ def test_without_a_view_the_points_are_those_of_the_other_two(missing):
     calibrations, orientation = known()
     frames = tracking(0.5, 40).frames
     others = [name for name in 'abc' if name != missing]
-    recording = Recording(frames, calibrations, Intersector(orientation))
+    recording = RigRecording(frames, calibrations, Intersector(orientation))
     whole = recording.reconstruct()
     two = replace(recording, intersector=Intersector(orientation.subset(others))).reconstruct()
     kept = [f for f in frames[missing] if f.number % 2]
@@ -163,7 +163,7 @@ def test_every_exposure_of_two_views_is_reconstructed(by, seed):
             ]
             for k, (name, of_one) in enumerate(kept.items())
         }
-    recording = Recording(kept, calibrations, Intersector(orientation), RecordedPairing(by))
+    recording = RigRecording(kept, calibrations, Intersector(orientation), RecordedPairing(by))
     found, unpaired = recording.reconstruct(), recording.unpaired
     views = np.sum(list(there.values()), axis=0)
     rows = np.flatnonzero(views >= 2)
@@ -179,7 +179,7 @@ def test_a_target_in_one_view_of_two_has_the_status_single_view():
     frames = {name: of_one[:1] for name, of_one in tracking(0.5, 40).frames.items() if name != 'c'}
     one = frames['a'][0]
     frames['a'] = [replace(one, target_id=one.target_id[3:], uv=one.uv[3:])]
-    recording = Recording({**frames, 'c': []}, calibrations, Intersector(orientation))
+    recording = RigRecording({**frames, 'c': []}, calibrations, Intersector(orientation))
     (found,) = recording.reconstruct()
     assert found.points.status.tolist() == 3 * [SINGLE_VIEW] + 21 * [OK]
 
@@ -238,7 +238,7 @@ def test_the_state_is_that_of_a_watch_fed_frame_by_frame():
     calibrations, orientation = known('ab')
     frames, watch = drifted()
     live = RigDriftWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
-    Recording(frames, calibrations, Intersector(orientation)).reconstruct(live)
+    RigRecording(frames, calibrations, Intersector(orientation)).reconstruct(live)
     assert live.state == watch.state and live.state.level == ERROR
 
 

@@ -16,7 +16,7 @@ from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.jobs.reconstruction import reconstruct
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (
-    Recording,
+    RigRecording,
     corrected_view,
 )
 from fluoro_calib_ros.reconstruction.timing import (
@@ -65,7 +65,7 @@ def recorded(steps, names='ab', seed=4, seconds=2.0, rate_hz=RATE_HZ):
 def found(frames, names='ab', orientation=None):
     calibrations, known_orientation = known(names)
     intersector = Intersector((orientation or known_orientation).subset(list(names)))
-    return timing_of_recording(Recording(frames, calibrations, intersector))
+    return timing_of_recording(RigRecording(frames, calibrations, intersector))
 
 
 @pytest.mark.parametrize('names', ['ab', 'abc'])
@@ -175,7 +175,7 @@ def test_points_without_noise_are_judged():
         name: [replace(f, sigma=np.full(len(f.uv), 1e-12)) for f in frames]
         for name, frames in recorded(2).items()
     }
-    recording = Recording(exact, calibrations, Intersector(orientation))
+    recording = RigRecording(exact, calibrations, Intersector(orientation))
     with np.errstate(all='raise'):
         timing_of_recording(recording)
 
@@ -199,14 +199,14 @@ def test_a_stream_is_judged_if_its_rays_miss():
     calibrations, orientation = known()
     recent = RecentExposures(lambda frame: corrected_view(frame, calibrations[frame.fluoroscope]))
     frames = recorded(2, seconds=12.0, rate_hz=5.0)
-    recording = Recording(frames, calibrations, Intersector(orientation))
+    recording = RigRecording(frames, calibrations, Intersector(orientation))
     for exposure, frame in zip(recording.exposures, recording.reconstruct(), strict=True):
         recent.add(exposure, frame.points)
     misses, timing = recent.faults(orientation, is_doubtful=False)
     assert misses.kind is timing.kind is Kind.FRAMES_DELAYED and misses.numbers['share'] > 0.5
     slow = RecentExposures(lambda frame: corrected_view(frame, calibrations[frame.fluoroscope]))
     frames = recorded(2)
-    recording = Recording(frames, calibrations, Intersector(orientation))
+    recording = RigRecording(frames, calibrations, Intersector(orientation))
     for exposure, frame in zip(recording.exposures, recording.reconstruct()):
         slow.add(exposure, frame.points)
     assert slow.faults(orientation, is_doubtful=False) == (None, None)

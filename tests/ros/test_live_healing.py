@@ -29,7 +29,7 @@ from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.messages.points import PointsContent, encode_reconstructed_points
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.reconstruct import Recording
+from fluoro_calib_ros.reconstruction.reconstruct import RigRecording
 from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -215,7 +215,7 @@ def test_deviations_between_alarm_and_healing_are_those_of_the_recording(rig):
     sizes = {name: calibrations[name].image_size for name in NAMES}
     watch = RigDriftWatch(orientation, sizes)
     intersector = Intersector(orientation, ReconstructionOptions().reject)
-    offline = Recording(frames, calibrations, intersector).reconstruct(watch)
+    offline = RigRecording(frames, calibrations, intersector).reconstruct(watch)
     assert watch.widening is not None
     for message, frame in zip(rig.points[first:], offline, strict=True):
         content = PointsContent(

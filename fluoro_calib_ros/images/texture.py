@@ -17,10 +17,11 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, logit, logsumexp
+from scipy.interpolate import make_interp_spline
+from scipy.special import expit, logit, logsumexp, softmax
 
 from ..rows import joined_rows
-from .light import POLYNOMIAL, vertex
+from .light import POLYNOMIAL
 
 DTYPE = np.float32  # type of models and derivatives
 HIGHEST = 9  # highest number of half waves across a window
@@ -32,10 +33,14 @@ EXPONENT = 3.0
 # eight renderings with plates, errors were the same to 2 % with 10 to 300; the larger, the smaller
 # were their standard deviations.
 EDGE = 10.0
-# Ratios of the variance of the background to that of the noise that are compared. The likelihood
-# is wider than their steps: 20 cosines determine the strength to a factor of 1.4.
+# Ratios of the variance of the background to that of the noise that are compared, and those at
+# which the likelihood is computed. It is interpolated between them: it is wider than their steps,
+# for 20 cosines determine the strength to a factor of 1.4.
 STEP = 4.0
-RATIOS = STEP ** np.arange(-2, 7)
+COMPUTED = np.arange(-2.0, 7.0)  # powers of STEP
+COMPARED = np.arange(-2, 6.1, 0.25)
+RATIOS = STEP**COMPARED
+BETWEEN = make_interp_spline(COMPUTED, np.eye(len(COMPUTED)))(COMPARED)
 ROUNDS = 3  # iterations over the strengths and the factor on the noise
 EM_STEPS = 30  # iterations after which the share of windows has converged to 0.01
 # Directions across edges that are tried, 7.5 degrees apart: at the border of a window, an edge is
@@ -187,45 +192,37 @@ class Spectra:
     noise: NDArray[np.floating]  #: (g,), variance of a typical pixel
 
     def strengths(self, excess: float) -> Strengths:
-        """Return the variances of the backgrounds, 0 for windows that more likely have none.
+        """Return the expected variances of the backgrounds.
 
         The share of windows with a background and a common factor on the noise are estimated with
-        the strengths. excess: variance of slow waves of the noise over that of white noise.
+        them. excess: variance of slow waves of the noise over that of white noise.
         """
         log_det, explained = self._marginals(excess)
         squared = self.products[:, -1, -1]
-        window = np.arange(len(squared))
-        likely = np.zeros(len(squared), dtype=bool)
-        best = np.zeros(len(squared), dtype=int)
+        probability = np.zeros_like(explained)  # of the ratios; otherwise there is no background
         for _ in range(ROUNDS):
-            mean_square = (squared - np.where(likely, explained[best, window], 0.0)) / self.freedom
-            scale = float(np.median(mean_square))
+            remaining = squared - np.sum(probability * explained, axis=0)
+            scale = float(np.median(remaining / self.freedom))
             gain = 0.5 * (explained / (scale * excess) - log_det)
-            best = np.argmax(gain, axis=0)
-            likely = _likely(_evidence(gain))
-        strengths = self._most_likely(gain, scale)
-        return replace(strengths, variance=np.where(likely, strengths.variance, 0.0))
+            probability = softmax(gain, axis=0) * _probability(_evidence(gain))
+        ratio = RATIOS @ probability
+        # A background below the least ratio is not told from the noise.
+        variance = np.where(ratio > RATIOS[0], ratio, 0.0) * self.noise
+        return Strengths(variance, _evidence(gain), scale)
 
     def strengths_at(self, excess: float, scale: float) -> Strengths:
-        """Return the variances of the backgrounds of windows that have one.
+        """Return the expected variances of the backgrounds of windows that have one.
 
         scale: factor on the noise.
         """
         log_det, explained = self._marginals(excess)
-        return self._most_likely(0.5 * (explained / (scale * excess) - log_det), scale)
-
-    def _most_likely(self, gain: NDArray[np.float64], scale: float) -> Strengths:
-        """Return the most likely variances, given log-likelihoods (r, g) at the ratios."""
-        best = np.argmax(gain, axis=0)
-        inner = np.clip(best, 1, len(RATIOS) - 2)
-        window = np.arange(len(best))
-        offset = vertex(*(gain[inner + step, window] for step in (-1, 0, 1)))
-        ratio = RATIOS[best] * np.where(inner == best, STEP**offset, 1.0)
-        return Strengths(ratio * self.noise, _evidence(gain), scale)
+        gain = 0.5 * (explained / (scale * excess) - log_det)
+        return Strengths(RATIOS @ softmax(gain, axis=0) * self.noise, _evidence(gain), scale)
 
     def _marginals(self, excess: float) -> NDArray[np.float64]:
         """Return log-determinants and explained squared residuals (2, r, g) at the ratios."""
-        return np.stack([self._marginal(ratio / excess) for ratio in RATIOS], axis=1)
+        computed = [self._marginal(ratio / excess) for ratio in STEP**COMPUTED]
+        return np.asarray(np.einsum('rc,ckg->krg', BETWEEN, computed))
 
     def _marginal(self, ratio: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return log-determinants (g,) and the squared residuals that a background explains."""
@@ -242,8 +239,8 @@ def _evidence(gain: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(logsumexp(gain, axis=0) - np.log(len(RATIOS)))
 
 
-def _likely(evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (g,) whether windows are of a kind, given the log-evidence (g,) for it.
+def _probability(evidence: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability (n,) that windows are of a kind, given the log-evidence (n,) for it.
 
     Their share is unknown and estimated by expectation-maximisation (Dempster, Laird and Rubin, J.
     R. Stat. Soc. B 39, 1977).
@@ -253,7 +250,7 @@ def _likely(evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
     for _ in range(EM_STEPS):
         share = np.mean(expit(evidence + odds))
         odds = float(logit(np.clip(share, min_share, 1 - min_share)))
-    return np.asarray(evidence + odds > 0)
+    return np.asarray(expit(evidence + odds))
 
 
 @dataclass(frozen=True)
@@ -300,7 +297,7 @@ class Texture:
                 own = order[across[textured] == one]
                 spectra.append(self._spectra(one, tuple(values[own] for values in part)))
             edges = joined_rows(spectra).strengths_at(excess, strengths.scale)
-            better = _likely(edges.evidence - strengths.evidence[textured])
+            better = _probability(edges.evidence - strengths.evidence[textured]) > 0.5
             strength[rows[textured[better]]] = edges.variance[better]
             direction[rows[textured[better]]] = across[textured[better]]
         return replace(self, strength=strength, across=direction)

@@ -151,7 +151,7 @@ def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
     assert off[:2].min() > 0.03 and off[2] < 0.03
     assert (off < 3 * beads.sigma).all()
     # The isolated bead is limited by the noise only.
-    assert beads.sigma[2] < 0.01 < 0.025 < beads.sigma[:2].min()
+    assert beads.sigma[2] < 0.011 < 0.025 < beads.sigma[:2].min()
 
 
 def test_a_shadow_that_a_larger_one_hides_is_less_sure():

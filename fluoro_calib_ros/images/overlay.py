@@ -24,9 +24,9 @@ OVERLAPPED = (230, 200, 40)
 REFUSED = (60, 60, 255)
 UNEXPLAINED = (0, 190, 255)
 TEXT = (235, 235, 235)
-OUTLINE = (0, 0, 0)
-TEXT_HEIGHT = 18
-QUALITY = 80  # quality of a small JPEG
+TEXT_HEIGHT = 18  # height of a line of text [px]
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+QUALITY = 80  # quality of a small JPEG, which is looked at and not measured
 
 
 def draw_overlay(
@@ -110,12 +110,14 @@ def _square(
 def _labelled(
     picture: NDArray[np.uint8], lines: list[tuple[str, tuple[int, int, int]]]
 ) -> NDArray[np.uint8]:
-    """Return a picture with lines of text below it."""
+    """Return a picture with lines of text below it, which are reduced to its width."""
     width = picture.shape[1]
     band = np.zeros((TEXT_HEIGHT * len(lines) + 8, width, 3), np.uint8)
     for number, (text, colour) in enumerate(lines):
         place = (6, TEXT_HEIGHT * (number + 1) - 2)
-        cv2.putText(band, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+        size = cv2.getTextSize(text, FONT, 0.45, 1)[0][0]
+        scale = 0.45 * min(1.0, (width - 12) / max(size, 1))
+        cv2.putText(band, text, place, FONT, scale, colour, 1, cv2.LINE_AA)
     return np.vstack([picture, band])
 
 
@@ -134,7 +136,7 @@ def draw_markers(
     """
     target_names = target_names or {}
     picture, factor = _picture(image)
-    size = cv2.getTextSize('0', cv2.FONT_HERSHEY_SIMPLEX, 0.35, 1)[0][1]
+    size = cv2.getTextSize('0', FONT, 0.35, 1)[0][1]
     marks = [
         (target, uv, UNEXPLAINED if doubtful else OVERLAPPED if overlapped else MATCHED, True)
         for target, uv, overlapped, doubtful in zip(
@@ -154,8 +156,7 @@ def draw_markers(
             cv2.drawMarker(picture, (u, v), colour, cv2.MARKER_TILTED_CROSS, RADIUS_PX, 1)
         text = target_names.get(int(target), str(int(target)))
         place = (u + RADIUS_PX + 1, v + size // 2)
-        font = cv2.FONT_HERSHEY_SIMPLEX
-        cv2.putText(picture, text, place, font, 0.35, colour, 1, cv2.LINE_AA)
+        cv2.putText(picture, text, place, FONT, 0.35, colour, 1, cv2.LINE_AA)
     lines = [
         (f'{len(markers.target_id)} markers, {int(markers.overlapped.sum())} overlapped', MATCHED),
         (f'{int(markers.doubtful.sum())} with a doubtful id', UNEXPLAINED),
@@ -168,7 +169,7 @@ def draw_markers(
 
 # Pictures of bodies.
 
-AXIS_COLOURS = ((80, 80, 255), (80, 255, 80), (255, 160, 80))  # x red, y green, z blue
+AXIS_COLOURS = (REFUSED, MATCHED, OVERLAPPED)  # x red, y green, z light blue
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> ND
     """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w), of even size.
 
     Circles are markers at the pose of their body, green where markers were seen; lines are the
-    axes of the body, x red, y green, z blue.
+    axes of the body, x red, y green, z light blue.
     """
     picture, factor = _picture(image)
     lines = [(title, TEXT)]
@@ -204,27 +205,15 @@ def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> ND
         for end, axis in zip(ends, AXIS_COLOURS):
             cv2.line(picture, centre, end, axis, 2, cv2.LINE_AA)
         place = (centre[0] + RADIUS_PX, centre[1] - RADIUS_PX)
-        for colour, width in ((OUTLINE, 3), (TEXT, 1)):  # legible on any background
-            cv2.putText(
-                picture,
-                body.name,
-                place,
-                cv2.FONT_HERSHEY_SIMPLEX,
-                0.45,
-                colour,
-                width,
-                cv2.LINE_AA,
-            )
+        # Black around the letters: legible on any background.
+        cv2.putText(picture, body.name, place, FONT, 0.45, (0,) * 3, 3, cv2.LINE_AA)
+        cv2.putText(picture, body.name, place, FONT, 0.45, TEXT, 1, cv2.LINE_AA)
     labelled = _labelled(picture, lines)
     return labelled[: len(labelled) // 2 * 2, : labelled.shape[1] // 2 * 2]
 
 
-COVERED = (60, 150, 70)  # RGB
 MISSING = (90, 90, 90)
-NEXT = (255, 200, 0)
-TEXT_ROWS = 22  # height of a line of text [px]
 WIDTH = 480  # width of the picture [px]
-FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def coverage_picture(
@@ -237,13 +226,11 @@ def coverage_picture(
 
     covered: (rows, columns) of bool; image_size: (width, height) [px] of the image, whose aspect
     ratio the picture has; areas: those that the next pose should show, framed, numbered in rows of
-    three from the top left. Returns (h, w, 3) of uint8, RGB.
+    three from the top left. Returns (h, w, 3) of uint8, blue, green, red.
     """
     width, height = image_size
     rows = max(1, round(WIDTH * height / width))
-    colours = np.where(
-        covered[..., None], np.array(COVERED, np.uint8), np.array(MISSING, np.uint8)
-    )
+    colours = np.where(covered[..., None], MATCHED, MISSING).astype(np.uint8)
     picture = cv2.resize(colours, (WIDTH, rows), interpolation=cv2.INTER_NEAREST)
     for i in (1, 2):  # the areas that the advice names
         cv2.line(picture, (WIDTH * i // 3, 0), (WIDTH * i // 3, rows), TEXT, 1)
@@ -252,11 +239,5 @@ def coverage_picture(
         row, column = divmod(area, 3)
         first = (WIDTH * column // 3 + 3, rows * row // 3 + 3)
         last = (WIDTH * (column + 1) // 3 - 4, rows * (row + 1) // 3 - 4)
-        cv2.rectangle(picture, first, last, NEXT, 4)
-    text = np.zeros((TEXT_ROWS * len(lines) + 8, WIDTH, 3), np.uint8)
-    for i, line in enumerate(lines):
-        place = (6, TEXT_ROWS * (i + 1) - 6)
-        size = cv2.getTextSize(line, FONT, 0.45, 1)[0][0]
-        scale = 0.45 * min(1.0, (WIDTH - 12) / max(size, 1))
-        cv2.putText(text, line, place, FONT, scale, TEXT, 1, cv2.LINE_AA)
-    return np.vstack([picture, text])
+        cv2.rectangle(picture, first, last, UNEXPLAINED, 4)
+    return _labelled(picture, [(line, TEXT) for line in lines])

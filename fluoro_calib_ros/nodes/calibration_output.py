@@ -14,6 +14,7 @@ from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, Rig
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 
 from ..correction import fluoroscope_calibration as calibration_result
 from ..images.overlay import coverage_picture
@@ -21,7 +22,7 @@ from ..io.calibration import Verdict
 from ..io.versions import calibrated_orientation
 from ..photogrammetry import rig_orientation
 from .messages.fluoroscope_calibration import message_from_calibration
-from .messages.image import colour_message
+from .messages.image import message_from_image
 from .messages.rig_orientation import message_from_orientation
 from .messages.status import Progress, message_from_progress
 from .runtime import conditions
@@ -122,7 +123,8 @@ class CalibrationOutput:
         )
         size = progress.image_size or (1, 1)
         picture = coverage_picture(progress.covered, size, lines, progress.readiness.areas)
-        self._coverage[name].publish(colour_message(picture, stamp, f'{name}_optical'))
+        header = Header(stamp=stamp, frame_id=f'{name}_optical')
+        self._coverage[name].publish(message_from_image(header, picture))
 
 
 @dataclass(frozen=True)

@@ -219,16 +219,16 @@ def test_covered_cells_are_green_where_they_are(size):
     covered = np.array([[True, False], [False, False], [False, True]])
     picture = overlay.coverage_picture(covered, size, ('line',), [5])
     rows = round(480 * size[1] / size[0])
-    assert picture.shape == (rows + 30, 480, 3)
+    assert picture.shape == (rows + 18 + 8, 480, 3)
 
     def at(x, y):
         return colours_at(picture, int(x * 480), int(y * rows))
 
-    assert at(0.2, 0.1) == overlay.COVERED and at(0.8, 0.1) == overlay.MISSING
-    assert at(0.2, 0.9) == overlay.MISSING and at(0.8, 0.9) == overlay.COVERED
+    assert at(0.2, 0.1) == overlay.MATCHED and at(0.8, 0.1) == overlay.MISSING
+    assert at(0.2, 0.9) == overlay.MISSING and at(0.8, 0.9) == overlay.MATCHED
     assert colours_at(picture, 160, 3) == overlay.TEXT == colours_at(picture, 320, 3)
     assert colours_at(picture, 3, rows // 3) == colours_at(picture, 3, 2 * rows // 3)
-    framed = (picture[:rows] == overlay.NEXT).all(axis=2)
+    framed = (picture[:rows] == overlay.UNEXPLAINED).all(axis=2)
     v, u = np.nonzero(framed)
     assert u.min() >= 320 and u.max() < 480
     assert v.min() >= rows // 3 and v.max() < 2 * rows // 3 and framed.any()

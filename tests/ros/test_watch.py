@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from ros_graph import BAGS, NAMES, standing
 from sensor_msgs.msg import Image
 
+from fluoro_calib_ros.images.overlay import MATCHED
 from fluoro_calib_ros.nodes.dashboard.watch import SessionClient
 from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
@@ -54,7 +55,7 @@ def test_session_is_run_from_the_dashboard(graph, watch, exposures, tmp_path):
     client.wait_until(lambda: pictures, what='a picture of the coverage')
     picture = pictures[-1]
     colours = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.width, 3)
-    green = (colours[: picture.width] == (60, 150, 70)).all(axis=2).mean()
+    green = (colours[: picture.width] == MATCHED).all(axis=2).mean()
     assert abs(green - fluoroscope().coverage) < 0.05
     client.wait_until(
         lambda: 'ready: receiving a/target_observations, b/target_observations' in node.log,

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
 from fluoro_calib_msgs.msg import ReconstructedPoints, RigOrientation, TargetObservations
 from rclpy.context import Context
@@ -137,13 +136,13 @@ class Scene:
     def coverage(self, name: str) -> bytes:
         """Return the coverage picture of a fluoroscope as PNG, or b'' if there is none."""
         message = self._last(f'{name}/coverage', Image)
-        if message is None or message.encoding != 'rgb8':
+        if message is None or message.encoding != 'bgr8':
             return b''
         shape = message.height, message.width, 3
         picture = np.frombuffer(message.data, np.uint8)
         if picture.size != math.prod(shape):
             return b''
-        return encode(cv2.cvtColor(picture.reshape(shape), cv2.COLOR_RGB2BGR), '.png', 0)
+        return encode(picture.reshape(shape), '.png', 0)
 
     def space(self) -> dict[str, Any]:
         """Return the newest points in space and the sources of the fluoroscopes [mm].

@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
@@ -104,20 +103,6 @@ class ImageConverter:
             f'fluoroscope {self._fluoroscope}, image of {stamp.sec}.{stamp.nanosec:09d} s: '
             f'{reason}',
         )
-
-
-def colour_message(image: NDArray[np.uint8], stamp: Time, frame_id: str) -> Image:
-    """Return the Image of a colour picture (h, w, 3) of uint8 in RGB order."""
-    message = Image(
-        height=image.shape[0],
-        width=image.shape[1],
-        encoding='rgb8',
-        step=3 * image.shape[1],
-        data=array('B', np.ascontiguousarray(image).tobytes()),
-    )
-    message.header.stamp = stamp
-    message.header.frame_id = frame_id
-    return message
 
 
 def message_from_image(header: Header, image: np.ndarray) -> Image:

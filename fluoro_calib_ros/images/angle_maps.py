@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 from ..correction.angle_field import AngleField
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.series import sd_grid_pixels
 from .corrector import (
+    FULL_STEPS,
     LIMIT_PX,
-    ROWS,
     STRIPE,
     ImageCorrector,
     continued,
@@ -36,10 +37,7 @@ from .corrector import (
 )
 
 NODE_PX = 8  # distance between nodes at which the change is iterated
-STEPS = 3  # iterations; each leaves the fraction by which the change differs per pixel
 TURN = np.deg2rad(np.arange(360.0))  # angles at which the change and its rate are measured
-SIDE = 17  # side of the grid of pixels at which it is measured
-MIN_RATE = 1e-3  # rate of change of a pixel [px/rad] below which one map serves all angles
 
 
 class AngleMaps:
@@ -63,7 +61,8 @@ class AngleMaps:
         self._field = calibration.angle_field
         if self._field is not None:
             rate, largest = _rate(self._field)
-            self.step = 2 * LIMIT_PX / rate if rate > MIN_RATE else np.inf
+            # If half a turn moves no pixel by more than the limit, one map serves all angles.
+            self.step = 2 * LIMIT_PX / rate if np.pi * rate > LIMIT_PX else np.inf
             self._base = _Base(calibration, int(np.ceil(largest)) + NODE_PX)
 
     def rounded(self, angle: float | None) -> float | None:
@@ -103,8 +102,8 @@ class _Base:
         width, height = (side + 2 * margin for side in self._size)
         source = np.empty((2, height, width), dtype=np.float32)
         bad = np.empty((height, width), dtype=np.uint8)
-        for start in range(0, height, ROWS):
-            rows = np.arange(start, min(start + ROWS, height))
+        for start in range(0, height, STRIPE):
+            rows = np.arange(start, min(start + STRIPE, height))
             u = np.tile(np.arange(width), len(rows)) - margin
             v = np.repeat(rows, width) - margin
             ideal = np.stack([u, v]).astype(float)
@@ -205,12 +204,16 @@ class _Base:
         """Return the change of the correction, and the shift of sources (2, rows, columns)."""
         shift = self._shift_of_nodes
         change = np.zeros_like(self._nodes)
-        for _ in range(STEPS):
+        for _ in range(FULL_STEPS):
+            before = change
             source = self._nodes + change + shift - self.margin
             source = np.clip(source, -self.margin, self._size + np.float32(self.margin))
             change = field.duv(source.reshape(-1, 2), angle).reshape(change.shape)
             change = change.astype(np.float32)
             shift = self._shift_at(self._nodes + change)
+            # A step leaves the fraction by which the change differs per pixel.
+            if np.abs(change - before).max() < LIMIT_PX:
+                break
         return change, np.stack(cv2.split(change + shift - self._shift_of_nodes))
 
     def _shift_at(self, places: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -260,10 +263,8 @@ def _rate(field: AngleField) -> tuple[float, float]:
 
     Beyond the angles that the field covers, its change is extrapolated without a limit.
     """
-    width, height = field.image_size
-    u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, SIDE), np.linspace(-0.5, height - 0.5, SIDE))
-    uv = np.column_stack([u.ravel(), v.ravel()])
-    changes = np.array([field.change(uv, float(angle))[0] for angle in TURN])
+    uv = sd_grid_pixels(field.image_size)
+    changes = np.array([field.duv(uv, float(angle)) for angle in TURN])
     rates = np.diff(changes, axis=0, append=changes[:1]) / (TURN[1] - TURN[0])
     covered = field.covers(TURN)
     return _longest(rates[covered]), _longest(changes[covered])

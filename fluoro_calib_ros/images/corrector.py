@@ -33,11 +33,9 @@ STEP_PX = 0.001  # step below which the iteration of a source ends
 # Number of steps: full steps, then half steps where full steps do not converge.
 FULL_STEPS = 12
 HALF_STEPS = 60
-# Rows iterated at once: they fit into the cache, and other threads do not wait for long.
-ROWS = 16
-STRIPE = 256  # rows whose map is made at once; threads wait for each other after each step
-NOWHERE = -10_000.0  # source of a pixel that has none: far off any image
-SHARPNESS = -0.75  # parameter of OpenCV's cubic convolution
+STRIPE = 64  # rows made at once: they fit into a cache, and other threads do not wait for long
+NOWHERE = -float(MAX_IMAGE_SIDE)  # source of a pixel that has none: off any image
+SHARPNESS = -0.75  # parameter of OpenCV's cubic convolution (`interpolateCubic`)
 
 
 class Sources(Protocol):
@@ -214,8 +212,8 @@ def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> Sources:
     width, height = image_size
     source = np.empty((2, height, width), dtype=np.float32)
     status = np.empty((height, width), dtype=np.uint8)
-    for start in range(0, height, ROWS):
-        rows = np.arange(start, min(start + ROWS, height))
+    for start in range(0, height, STRIPE):
+        rows = np.arange(start, min(start + STRIPE, height))
         u = np.tile(np.arange(width), len(rows))
         v = np.repeat(rows, width)
         observed, row_status = _invert_correction(grid, np.stack([u, v]).astype(float))

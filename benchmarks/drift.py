@@ -17,7 +17,7 @@ import multiprocessing
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -218,19 +218,15 @@ def feed(scene_: Scene, watch: DriftWatch, block: Block, clusters: bool = True) 
     found = scene_.geometry.residuals(corrected[a], corrected[b], systematic[a], systematic[b])
     sd_noise = np.hypot(found.factor_a * noise[0], found.factor_b * noise[1])
     good = np.abs(found.residual) <= REJECT * np.hypot(sd_noise, found.sd_total)
+    systematic_and_noise = replace(found, sd_total=np.hypot(sd_noise, found.sd_total))
     residuals = EpipolarObservations(
-        np.tile(IDS, FRAMES),
-        seen[a],
-        seen[b],
-        found.residual,
-        sd_noise,
-        found.sd_total,
-        found.normal_a,
-        found.normal_b,
-        found.factor_a,
-        found.factor_b,
+        **vars(systematic_and_noise),
+        target_id=np.tile(IDS, FRAMES),
+        uv_a=seen[a],
+        uv_b=seen[b],
+        noise=sd_noise**2,
     )
-    state = watch.add_residuals(stamps[0], a, b, residuals)
+    state = watch.add_residuals(stamps[0], 0, residuals)
     if clusters:
         uv = np.stack([corrected[a], corrected[b]])
         uv[:, ~good] = np.nan

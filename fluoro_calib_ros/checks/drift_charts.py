@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from ..exposures.frame import cells_of
 from ..findings import Finding, Severity
 from ..options import option, validate_options
-from ..rows import chosen_rows, joined_rows
+from ..reconstruction.epipolar import EpipolarResiduals
+from ..rows import chosen_rows
 
 # Levels of an alarm; the values are those of the message DriftStatus.
 OK = Severity.NOTE
@@ -175,42 +176,31 @@ class DriftOptions:
 
 
 @dataclass(frozen=True)
-class EpipolarObservations:
+class EpipolarObservations(EpipolarResiduals):
     """Epipolar residuals of n markers in one pair of views, a and b.
 
     Rows with a value that is not finite are ignored. Include residuals that are too large for a
     match: they are clipped, and a large drift produces no other residuals.
-
-    Raises ValueError for arrays of inconsistent shape.
     """
 
     target_id: NDArray[np.integer]  #: (n,)
     #: (n, 2) positions of the markers in the images [px]
     uv_a: NDArray[np.float64]
     uv_b: NDArray[np.float64]
-    residual: NDArray[np.float64]  #: (n,) signed [px]
-    #: (n,) standard deviations of the residuals [px]: due to the noise of the image points, which
-    #: is independent in every frame, and due to the correction and the orientation, which are
-    #: constant at a place and do not average out
-    sd_noise: NDArray[np.float64]
-    sd_systematic: NDArray[np.float64]
-    #: (n, 2) normals of the epipolar lines, as in EpipolarResiduals
-    normal_a: NDArray[np.float64]
-    normal_b: NDArray[np.float64]
-    #: (n,) change of the residual by a shift of one pixel along the normal
-    factor_a: NDArray[np.float64]
-    factor_b: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        n = len(self.target_id)
-        for field in fields(self)[1:]:
-            expected = (n, 2) if field.name.startswith(('uv', 'normal')) else (n,)
-            shape = getattr(self, field.name).shape
-            if shape != expected:
-                raise ValueError(f'{field.name} must have the shape {expected}, not {shape}')
+    #: (n,) variances of the residuals due to the noise of the image points [px^2], which is
+    #: independent in every frame
+    noise: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.target_id)
+
+    @property
+    def systematic(self) -> NDArray[np.float64]:
+        """Variances (n,) due to the correction and the orientation [px^2].
+
+        These errors are constant at a place and do not average out.
+        """
+        return np.maximum(self.sd_total**2 - self.noise, 0)
 
     @property
     def uv(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -227,33 +217,13 @@ class EpipolarObservations:
         """Factors in both images."""
         return self.factor_a, self.factor_b
 
-    def swapped(self) -> EpipolarObservations:
-        """Return the same residuals with the views exchanged."""
-        return EpipolarObservations(
-            self.target_id,
-            self.uv_b,
-            uv_b=self.uv_a,
-            residual=self.residual,
-            sd_noise=self.sd_noise,
-            sd_systematic=self.sd_systematic,
-            normal_a=self.normal_b,
-            normal_b=self.normal_a,
-            factor_a=self.factor_b,
-            factor_b=self.factor_a,
-        )
-
     def usable(self) -> EpipolarObservations:
-        """Return the rows that are finite and have positive standard deviations and factors."""
-        is_usable = (self.sd_noise > 0) & (self.factor_a > 0) & (self.factor_b > 0)
+        """Return the rows that are finite and have positive variances and factors."""
+        is_usable = (self.noise > 0) & (self.factor_a > 0) & (self.factor_b > 0)
         for field in fields(self):
             finite = np.isfinite(getattr(self, field.name))
             is_usable &= finite if finite.ndim == 1 else finite.all(axis=1)
         return chosen_rows(self, is_usable)
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[EpipolarObservations]) -> EpipolarObservations:
-        """Return all rows of one or more observations, in order."""
-        return joined_rows(parts)
 
 
 # Areas of an image in which the drift watch tests for a drift.

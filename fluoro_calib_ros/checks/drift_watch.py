@@ -36,6 +36,7 @@ from ..exposures.stamps import Order, StampOrder
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
+from ..rows import joined_rows
 from .body_watch import COMPONENTS, BodyWatch
 from .drift_charts import (
     ERROR,
@@ -143,16 +144,15 @@ class DriftWatch:
         return self._tested_blocks * self.options.block_s
 
     def add_residuals(
-        self, stamp_ns: int, a: str, b: str, observations: EpipolarObservations
+        self, stamp_ns: int, pair: int, observations: EpipolarObservations
     ) -> DriftState:
-        """Add the epipolar residuals of one pair of frames of fluoroscopes a and b.
+        """Add the epipolar residuals of one pair of frames, and return the present state.
 
-        Returns the present state. Raises ValueError for an unknown pair of fluoroscopes.
+        pair: number of the pair of fluoroscopes, in the order of their combinations.
         """
-        number, is_swapped = self._pair_number(a, b)
         self._advance(stamp_ns)
         if len(observations):
-            self._collected[number].append(observations.swapped() if is_swapped else observations)
+            self._collected[pair].append(observations)
         return self.state
 
     def add_points(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
@@ -169,16 +169,6 @@ class DriftWatch:
         if self._body_watch:
             self._body_watch.add(exposure)
         return self.state
-
-    def _pair_number(self, a: str, b: str) -> tuple[int, bool]:
-        """Return the number of a pair, and whether its fluoroscopes are in reverse order."""
-        if (a, b) in self._pairs:
-            return self._pairs.index((a, b)), False
-        if (b, a) in self._pairs:
-            return self._pairs.index((b, a)), True
-        raise ValueError(
-            f'there is no pair of fluoroscopes {a!r} and {b!r}, only of {", ".join(self._names)}'
-        )
 
     def _advance(self, stamp_ns: int) -> None:
         """If the stamp is after the present block, update the charts and the state."""
@@ -203,7 +193,7 @@ class DriftWatch:
             if not collected:
                 continue
             self._collected[number] = []
-            observations = EpipolarObservations.concatenate(collected).usable()
+            observations = joined_rows(collected).usable()
             if not len(observations):
                 continue
             block = self._watches[number].block(observations)

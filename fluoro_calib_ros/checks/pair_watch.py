@@ -109,14 +109,14 @@ class PairWatch:
         """
         options = self._options
         _, marker = np.unique(observations.target_id, return_inverse=True)
-        sd = observations.sd_noise
-        systematic = observations.sd_systematic
+        variance = observations.noise
+        sd = np.sqrt(variance)
+        systematic = np.sqrt(observations.systematic)
         interpolations = [
             self.field.interpolation(uv, side) for side, uv in enumerate(observations.uv)
         ]
         nodes = np.concatenate([nodes for nodes, _ in interpolations], axis=1)
         weights = np.concatenate([weights for _, weights in interpolations], axis=1)
-        variance = sd * sd
         limit = (
             options.clip * sd
             + options.band_calibration * systematic
@@ -166,12 +166,12 @@ class PairWatch:
         """
         areas = self._areas
         factor = observations.factor[side]
-        weight = factor / (observations.sd_noise * observations.sd_noise)
+        weight = factor / observations.noise
         columns = [
             weight * residuals[0],
             weight * residuals[1],
             weight * factor,
-            weight * observations.sd_systematic,
+            weight * np.sqrt(observations.systematic),
             *observations.normal[side].T,
         ]
         sums = self._area_sums(cell, np.stack(columns))

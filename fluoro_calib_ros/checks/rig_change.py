@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from ..healing.sizes import ChangeStatistics, parts_of_interior, parts_of_knock
 from ..photogrammetry.noise import CERTAIN, NORMAL_MEDIAN
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
-from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
-from ..rows import joined_rows
+from ..reconstruction.epipolar import EpipolarGeometry
+from ..rows import chosen_rows, joined_rows
+from .drift_charts import EpipolarObservations
 
 WINDOW = 8  # newest blocks from which a change is estimated
 SIZES = np.geomspace(2.0**-7, 4.0, 10)  # sizes of a change, relative to a knock
@@ -75,40 +76,22 @@ class RigChange:
         self._orientation = orientation
         self._pairs = tuple(pairs)
         self._hypotheses = _hypotheses(orientation)
-        self._open: list[list[tuple[np.ndarray, ...]]] = [[] for _ in self._pairs]
+        self._open: list[list[EpipolarObservations]] = [[] for _ in self._pairs]
         self._blocks: deque[_Rays] = deque(maxlen=WINDOW)
         self._has_met = False
         self.blocks_apart = 0  #: consecutive blocks whose rays are apart
 
-    def add(
-        self,
-        number: int,
-        target_id: NDArray[np.integer],
-        uv: tuple[NDArray[np.float64], NDArray[np.float64]],
-        residuals: EpipolarResiduals,
-        noise: NDArray[np.float64],
-    ) -> None:
-        """Add the image points uv (n, 2) of a pair in an exposure.
-
-        noise (n,): variances of the residuals due to noise alone.
-        """
-        is_finite = np.isfinite(residuals.residual)
-        columns = (
-            target_id,
-            *uv,
-            residuals.residual,
-            noise,
-            residuals.sd_total**2 - noise,
-            np.abs(residuals.residual) > CERTAIN * residuals.sd_total,
-        )
-        self._open[number].append(tuple(column[is_finite] for column in columns))
+    def add(self, number: int, observations: EpipolarObservations) -> None:
+        """Add the image points of a pair in an exposure."""
+        is_finite = np.isfinite(observations.residual)
+        self._open[number].append(chosen_rows(observations, is_finite))
 
     def close(self) -> None:
         """End a block."""
         parts = [
-            self._median(number, [np.concatenate(column) for column in zip(*rows)])
-            for number, rows in enumerate(self._open)
-            if rows
+            self._median(number, joined_rows(collected))
+            for number, collected in enumerate(self._open)
+            if collected
         ]
         self._open = [[] for _ in self._pairs]
         if not parts:
@@ -131,22 +114,22 @@ class RigChange:
             return 0.0
         return float(self._blocks[-1].is_apart.mean())
 
-    def _median(self, number: int, columns: list[np.ndarray]) -> _Rays:
+    def _median(self, number: int, observations: EpipolarObservations) -> _Rays:
         """Return the median residual per marker in a block, which is robust to false matches."""
-        target_id, uv_a, uv_b, residual, noise, systematic, is_apart = columns
-        order = np.lexsort((residual, target_id))
-        _, first, count = np.unique(target_id[order], return_index=True, return_counts=True)
-        rows = order[first + count // 2]
+        order = np.lexsort((observations.residual, observations.target_id))
+        target_id = observations.target_id[order]
+        _, first, count = np.unique(target_id, return_index=True, return_counts=True)
+        rays = chosen_rows(observations, order[first + count // 2])
         i, j, geometry = self._pairs[number]
-        derivative = np.zeros((len(rows), ORIENTATION_SIZE * len(self._orientation.fluoroscopes)))
+        derivative = np.zeros((len(rays), ORIENTATION_SIZE * len(self._orientation.fluoroscopes)))
         columns_of_pair = self._orientation.covariance_rows([i, j])
-        derivative[:, columns_of_pair] = geometry.by_orientation(uv_a[rows], uv_b[rows])
+        derivative[:, columns_of_pair] = geometry.by_orientation(*rays.uv)
         return _Rays(
-            residual[rows],
-            MEDIAN_VARIANCE * noise[rows] / count,
-            np.maximum(systematic[rows], 0.0),
+            rays.residual,
+            MEDIAN_VARIANCE * rays.noise / count,
+            rays.systematic,
             derivative,
-            is_apart[rows],
+            np.abs(rays.residual) > CERTAIN * rays.sd_total,
         )
 
     def addition(self, blocks: int) -> Addition | None:

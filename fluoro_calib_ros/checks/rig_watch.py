@@ -23,6 +23,7 @@ from ..reconstruction.epipolar import UNKNOWN, EpipolarGeometry, missing_rays
 from ..reconstruction.intersection import OK as INTERSECTED
 from ..reconstruction.intersection import Intersector
 from ..reconstruction.reconstruct import IntersectedViews
+from ..rows import chosen_rows
 from .drift_charts import (
     ERROR,
     LEVEL_NAMES,
@@ -127,21 +128,12 @@ class RigDriftWatch:
             residuals = geometry.residuals(uv[i], uv[j], sigma[i], sigma[j])
             noise = residuals.factor_a**2 * noise2[i] + residuals.factor_b**2 * noise2[j]
             limit = CERTAIN * residuals.sd_total + FALSE_MATCH_PX
-            self._change.add(number, target_id, (uv[i], uv[j]), residuals, noise=noise)
-            accepted = np.flatnonzero(np.abs(residuals.residual) <= limit)
             observations = EpipolarObservations(
-                target_id[accepted],
-                uv[i][accepted],
-                uv_b=uv[j][accepted],
-                residual=residuals.residual[accepted],
-                sd_noise=np.sqrt(noise[accepted]),
-                sd_systematic=np.sqrt(np.maximum(residuals.sd_total**2 - noise, 0))[accepted],
-                normal_a=residuals.normal_a[accepted],
-                normal_b=residuals.normal_b[accepted],
-                factor_a=residuals.factor_a[accepted],
-                factor_b=residuals.factor_b[accepted],
+                **vars(residuals), target_id=target_id, uv_a=uv[i], uv_b=uv[j], noise=noise
             )
-            self._watch.add_residuals(stamp_ns, self._names[i], self._names[j], observations)
+            self._change.add(number, observations)
+            accepted = np.abs(residuals.residual) <= limit
+            self._watch.add_residuals(stamp_ns, number, chosen_rows(observations, accepted))
         if self._has_bodies:
             self._watch.add_points(stamp_ns, exposure)
         if self._watch.state is not self._of_charts:  # a block has ended

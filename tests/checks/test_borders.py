@@ -221,16 +221,17 @@ def test_what_an_alarm_adds_to_image_points_is_the_excess_of_their_variance(monk
 def observations(residual, marker=None):
     n = len(residual)
     return EpipolarObservations(
-        np.arange(n) if marker is None else np.asarray(marker),
-        np.full((n, 2), 10.0),
+        np.asarray(residual, dtype=float),
+        sd=np.full(n, 0.2),
+        sd_total=np.hypot(np.full(n, 0.2), 0.1),
+        target_id=np.arange(n) if marker is None else np.asarray(marker),
+        uv_a=np.full((n, 2), 10.0),
         uv_b=np.full((n, 2), 90.0),
-        residual=np.asarray(residual, dtype=float),
-        sd_noise=np.full(n, 0.2),
-        sd_systematic=np.full(n, 0.1),
         normal_a=np.tile([1.0, 0], (n, 1)),
         normal_b=np.tile([0.0, 1], (n, 1)),
         factor_a=np.full(n, 0.5),
         factor_b=np.full(n, 0.8),
+        noise=np.full(n, 0.2) ** 2,
     )
 
 

@@ -59,6 +59,7 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
 from fluoro_calib_ros.photogrammetry.noise import INLIER_Q
+from fluoro_calib_ros.rows import joined_rows
 
 SIZE = (1024, 768)
 RNG = np.random.default_rng(3)
@@ -796,10 +797,11 @@ def test_the_watch_tells_noise_from_what_is_common_to_exposures():
     watch._addition, watch._has_bodies, watch._names = None, False, ('a', 'b')
     watch._of_charts = watch._state = 'fine'
     watch._watch = Fake(state='fine', add_residuals=lambda *given: told.append(given))
-    watch._change = Fake(add=lambda *given, noise: told.append(noise))
+    watch._change = Fake(add=lambda *given: told.append(given))
     one, two, three = np.full(4, 0.5), np.full(4, 0.8), np.array([0.0, 1, -5.39, 5.41])
     found = Fake(
         residual=three,
+        sd=np.full(4, 0.3),
         sd_total=np.full(4, 0.6),
         normal_a=np.ones((4, 2)),
         normal_b=np.zeros((4, 2)),
@@ -813,12 +815,13 @@ def test_the_watch_tells_noise_from_what_is_common_to_exposures():
     )
     exposure = Fake(target_id=np.arange(4) + 7, views=views)
     assert watch.add_exposure(55, exposure) == 'fine' and watch._last_ns == 55
-    noise, (stamp, a, b, given) = told
+    (number, every), (stamp, pair, given) = told
     # Only the noise of a remains, that of b is all correction.
-    np.testing.assert_allclose(noise, 0.5**2 * (0.5**2 - 0.4**2))
-    assert (stamp, a, b) == (55, 'a', 'b') and given.target_id.tolist() == [7, 8, 9]
-    np.testing.assert_allclose(given.sd_noise**2 + given.sd_systematic**2, 0.6**2)
-    np.testing.assert_allclose(given.sd_noise**2, noise[:3])
+    np.testing.assert_allclose(every.noise, 0.5**2 * (0.5**2 - 0.4**2))
+    assert number == 0 and every.residual is three
+    assert (stamp, pair) == (55, 0) and given.target_id.tolist() == [7, 8, 9]
+    np.testing.assert_allclose(given.noise + given.systematic, 0.6**2)
+    np.testing.assert_allclose(given.noise, every.noise[:3])
     np.testing.assert_array_equal(given.residual, three[:3])
 
 
@@ -841,8 +844,9 @@ def observations(n=4, **changes):
         'uv_a': np.full((n, 2), 10.0),
         'uv_b': np.full((n, 2), 20.0),
         'residual': np.arange(n) + 1.0,
-        'sd_noise': np.full(n, 0.2),
-        'sd_systematic': np.full(n, 0.1),
+        'sd': np.full(n, 0.2),
+        'sd_total': np.full(n, np.hypot(0.2, 0.1)),
+        'noise': np.full(n, 0.2**2),
         'normal_a': np.tile([1.0, 0], (n, 1)),
         'normal_b': np.tile([0.0, 1], (n, 1)),
         'factor_a': np.full(n, 0.5),
@@ -851,23 +855,17 @@ def observations(n=4, **changes):
     return EpipolarObservations(**{**values, **changes})
 
 
-def test_observations_swap_their_views_and_leave_out_what_is_not_finite():
-    swapped = observations().swapped()
-    assert swapped.uv_a[0, 0] == 20 and swapped.normal_a[0].tolist() == [0, 1]
-    assert (swapped.factor_a[0], swapped.factor_b[0]) == (0.8, 0.5)
-    assert swapped.swapped().uv_b[0, 0] == 20 and swapped.residual.tolist() == [1, 2, 3, 4]
+def test_observations_leave_out_what_is_not_finite():
     bad = observations(
-        sd_noise=np.array([0.2, 0, 0.2, 0.2]),
+        noise=np.array([0.2, 0, 0.2, 0.2]),
         residual=np.array([1, 2, np.nan, 4]),
         uv_b=np.array([[1, np.inf], [1, 1], [1, 1], [1, 1]]),
     )
     assert bad.usable().target_id.tolist() == [3]
-    assert len(EpipolarObservations.concatenate([bad, observations()])) == 8
-    for name in ('sd_noise', 'factor_a', 'factor_b'):
+    assert len(joined_rows([bad, observations()])) == 8
+    for name in ('noise', 'factor_a', 'factor_b'):
         none = observations(**{name: np.array([0.1, 0.0, 0.3, -0.1])})
         assert none.usable().target_id.tolist() == [0, 2]
-    with pytest.raises(ValueError, match='factor_a'):
-        observations(factor_a=np.ones(3))
 
 
 def test_areas_of_an_image_are_cells_windows_halves_and_the_whole():
@@ -988,7 +986,7 @@ def test_statistics_of_a_block_are_sums_over_its_areas():
     areas = ImageAreas(2)
     watch = PairWatch([(100, 100), (100, 100)], areas, options)
     uv = np.array([[10.0, 10], [90, 10], [90, 90], [92, 92]])
-    given = observations(uv_a=uv, uv_b=uv[::-1].copy(), sd_systematic=np.arange(4) / 10)
+    given = observations(uv_a=uv, uv_b=uv[::-1].copy(), sd_total=np.hypot(0.2, np.arange(4) / 10))
     block = watch.block(given)
     whole = len(areas) - 1
     a, b = 0.5 / 0.04, 0.8 / 0.04

@@ -112,6 +112,12 @@ def test_causes_are_a_knock_and_a_shift_of_each_fluoroscope(names, knocked):
     np.testing.assert_allclose(found, expected)
 
 
+def rays(ids, uv, residual, sd_total, noise):
+    given = observations(residual, ids)
+    ones = np.ones(len(ids))
+    return replace(given, uv_a=uv, uv_b=uv + 1, sd_total=sd_total * ones, noise=noise * ones)
+
+
 def test_a_block_has_the_median_residual_of_each_marker():
     """With the variance of a median, at the position of the marker then."""
     geometry = Fake(by_orientation=lambda a, b: np.hstack([a, b, np.zeros((len(a), 14))]))
@@ -120,18 +126,17 @@ def test_a_block_has_the_median_residual_of_each_marker():
     for step, residual in enumerate(([3.0, -1, 0], [1.0, 5, np.nan], [2.0, -9, 0.2])):
         residual = np.array(residual)
         uv = np.full((3, 2), 10.0 * step)
-        found = Fake(residual=residual, sd_total=np.full(3, 2.0))
-        change.add(1, ids, (uv, uv + 1), found, np.full(3, 1.0 + step))
+        change.add(1, rays(ids, uv, residual, sd_total=2.0, noise=1.0 + step))
     change.close()
-    (rays,) = change._blocks
-    assert rays.residual.tolist() == [2.0, 0.2, -1.0]  # of ids 4, 5 (the upper of two) and 9
+    (block,) = change._blocks
+    assert block.residual.tolist() == [2.0, 0.2, -1.0]  # of ids 4, 5 (the upper of two) and 9
     expected = np.pi / 2 * np.array([3.0, 3.0, 1.0]) / [3, 2, 3]
-    np.testing.assert_allclose(rays.noise, expected)
-    np.testing.assert_allclose(rays.systematic, [1.0, 1.0, 3.0])
-    assert rays.by_rig[:, :2].tolist() == [[20, 20], [20, 20], [0, 0]]
-    assert rays.by_rig[:, 2:4].tolist() == [[21, 21], [21, 21], [1, 1]]
-    assert rays.by_rig.shape == (3, 27) and not rays.by_rig[:, 4:].any()
-    assert not rays.is_apart.any()
+    np.testing.assert_allclose(block.noise, expected)
+    np.testing.assert_allclose(block.systematic, [1.0, 1.0, 3.0])
+    assert block.by_rig[:, :2].tolist() == [[20, 20], [20, 20], [0, 0]]
+    assert block.by_rig[:, 2:4].tolist() == [[21, 21], [21, 21], [1, 1]]
+    assert block.by_rig.shape == (3, 27) and not block.by_rig[:, 4:].any()
+    assert not block.is_apart.any()
 
 
 @pytest.mark.parametrize(('residual', 'apart'), [(8.0, False), (8.1, True), (-8.1, True)])
@@ -139,8 +144,7 @@ def test_rays_are_apart_beyond_four_standard_deviations(residual, apart):
     geometry = Fake(by_orientation=lambda a, b: np.zeros((len(a), 18)))
     change = RigChange(orientation(('a', 'b')), [(0, 1, geometry)])
     uv = np.zeros((3, 2))
-    found = Fake(residual=np.full(3, residual), sd_total=np.full(3, 2.0))
-    change.add(0, np.arange(3), (uv, uv), found, np.full(3, 5.0))
+    change.add(0, rays(np.arange(3), uv, np.full(3, residual), sd_total=2.0, noise=5.0))
     change.close()
     assert change.blocks_apart == apart
     assert change._blocks[0].systematic.tolist() == [0, 0, 0]  # the noise exceeds the total
@@ -329,16 +333,17 @@ def observations(residual, ids=None):
     n = len(residual)
     uv = np.random.default_rng(8).uniform(0, 800, (2, n, 2))
     return EpipolarObservations(
-        np.arange(n) if ids is None else ids,
-        uv[0],
+        np.asarray(residual, dtype=float),
+        sd=np.linspace(0.2, 0.4, n),
+        sd_total=np.hypot(np.linspace(0.2, 0.4, n), 0.1),
+        target_id=np.arange(n) if ids is None else ids,
+        uv_a=uv[0],
         uv_b=uv[1],
-        residual=np.asarray(residual, dtype=float),
-        sd_noise=np.linspace(0.2, 0.4, n),
-        sd_systematic=np.full(n, 0.1),
         normal_a=np.tile([1.0, 0], (n, 1)),
         normal_b=np.tile([0.0, 1], (n, 1)),
         factor_a=np.full(n, 0.6),
         factor_b=np.full(n, 0.8),
+        noise=np.linspace(0.2, 0.4, n) ** 2,
     )
 
 
@@ -357,7 +362,7 @@ def test_series_against_the_start_are_less_the_field_and_as_unsure_as_it():
     np.put_along_axis(design, nodes, weights, axis=1)
     left = given.residual - design @ watch.field.mean
     for side, factor in ((0, 0.6), (1, 0.8)):
-        weight = factor / given.sd_noise**2
+        weight = factor / given.noise
         cell = areas.cell(given.uv[side], (1000, 800))
         for area in range(len(areas)):
             own = areas.member[area, cell] > 0
@@ -540,7 +545,7 @@ def test_an_alarm_has_a_positive_size_and_the_time_since_it_began(size, directio
 def test_rows_that_are_not_finite_make_no_block():
     watch = DriftWatch(SIZES)
     for second in range(4):
-        state = watch.add_residuals(10**9 * second, 'a', 'b', observations([np.nan] * 5))
+        state = watch.add_residuals(10**9 * second, 0, observations([np.nan] * 5))
     assert state.observations == 0 and state.finding.kind is Kind.NO_MARKERS
     assert not watch._epipolar._records
 
@@ -553,7 +558,7 @@ def test_the_start_is_learned_block_by_block_and_then_tested(monkeypatch):
     monkeypatch.setattr(field, 'estimate', asked.append)
     found = []
     for block in range(8):
-        watch.add_residuals(5 * 10**8 * block, 'b', 'a', observations(np.zeros(12)))
+        watch.add_residuals(5 * 10**8 * block, 0, observations(np.zeros(12)))
         found.append((watch.state.finding.kind, watch.state.learning, watch.watched_s))
     # A block is closed by the next one; the first four are used for learning.
     assert [kind for kind, _, _ in found] == (
@@ -564,8 +569,6 @@ def test_the_start_is_learned_block_by_block_and_then_tested(monkeypatch):
     factor = np.median(watch._epipolar.charts.variance_factor()[:2])
     assert asked == [pytest.approx(factor, rel=0.2)]
     assert watch.state.observations == 7 * 12
-    with pytest.raises(ValueError, match='no pair'):
-        watch.add_residuals(10**10, 'a', 'c', observations([0.0]))
 
 
 def test_dead_band_is_tolerance_and_systematic_deviations_together():

@@ -5,7 +5,6 @@
 
 import functools
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from rigs import true_calibrations, true_orientation
 from scipy.special import ndtri
 
 from fluoro_calib_ros.bodies.body import Body
-from fluoro_calib_ros.checks.drift_charts import ERROR
+from fluoro_calib_ros.checks.drift_charts import ERROR, EpipolarObservations
 from fluoro_calib_ros.checks.rig_change import RigChange
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.findings import Kind
@@ -127,8 +126,11 @@ def shown_blocks(geometry, blocks):
     for missed in blocks:
         for row in np.broadcast_to(missed, (5, np.shape(missed)[-1])):
             uv = np.linspace([300.0, 700.0], [600.0, 400.0], len(row))
-            found = SimpleNamespace(residual=row, sd_total=np.ones(len(row)))
-            change.add(0, np.arange(len(row)), (uv, uv), found, np.full(len(row), 0.1))
+            one = np.ones(len(row))
+            given = EpipolarObservations(
+                row, one, one, uv, uv, one, one, np.arange(len(row)), uv, uv, 0.1 * one
+            )
+            change.add(0, given)
         change.close()
     return change
 

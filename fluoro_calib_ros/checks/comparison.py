@@ -29,12 +29,14 @@ from ..estimation.estimator import interior_about, orientation_fields
 from ..estimation.model_choice import MIN_PIXELS
 from ..estimation.signal import MIN_SD_PX
 from ..exposures.frame import cells_of
+from ..photogrammetry.outliers import SIGNIFICANCE
+from ..rows import chosen_rows
 
 # The comparison is the cross-validation of mrcal (D. Kogan, mrcal documentation, "A tour of mrcal:
 # cross-validation"): two calibrations that share no exposure make the same predictions, except for
 # what the orientation absorbs and for their noise.
 
-GRID = 24  # points across the image at which predictions are compared
+GRID = 24  # cells along the longer side of the image in whose centres predictions are compared
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,6 @@ class FieldDifference:
         return self.uv[np.argmax(np.linalg.norm(self.duv, axis=1) / self.sd)]
 
 
-def image_grid(image_size: tuple[int, int]) -> NDArray[np.float64]:
-    """Return pixels (GRID^2, 2), evenly spaced over an image (width, height)."""
-    u, v = ((np.arange(GRID) + 0.5) / GRID * size - 0.5 for size in image_size)
-    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-
-
 def difference(
     one: FluoroscopeCalibration, other: FluoroscopeCalibration
 ) -> FieldDifference | None:
@@ -76,17 +72,20 @@ def difference(
     at the mean principal distance, after removing the best combination of `orientation_fields`.
     Returns None if the area is too small.
     """
-    grid = image_grid(one.image_size)
-    corrections = at_common_angle(grid, one, other)
+    uv, corrections = _common(one, other, GRID)
+    return _difference(uv, (one.interior, other.interior), corrections) if len(uv) else None
+
+
+def _common(
+    one: FluoroscopeCalibration, other: FluoroscopeCalibration, cells: int
+) -> tuple[NDArray[np.float64], list[Correction]]:
+    """Return pixels (n, 2) that both calibrations cover, and both corrections; none if too few."""
+    _, uv = cell_centres(one.image_size, cells)
+    corrections = at_common_angle(uv, one, other)
     inside = ~(corrections[0].outside | corrections[1].outside)
     if inside.sum() < MIN_PIXELS:
-        return None
-    parts = [_part(correction, inside) for correction in corrections]
-    return _difference(grid[inside], (one.interior, other.interior), parts)
-
-
-def _part(correction: Correction, rows: NDArray[np.bool_]) -> Correction:
-    return Correction(correction.duv[rows], correction.sd[rows], correction.outside[rows])
+        inside[:] = False
+    return uv[inside], [chosen_rows(correction, inside) for correction in corrections]
 
 
 def _difference(
@@ -124,7 +123,6 @@ def describe_place(uv: ArrayLike, image_size: tuple[int, int]) -> str:
 
 
 CELLS = 64  # number of cells along the longer side of the image
-LEVEL = 0.99  # confidence level
 
 
 @dataclass(frozen=True)
@@ -151,7 +149,7 @@ class Comparison:
     @property
     def significant(self) -> NDArray[np.bool_]:
         """Whether (n,) each difference exceeds its 99 % quantile."""
-        return self.size**2 > chdtri(2, 1 - LEVEL) * self.sd**2
+        return self.size**2 > chdtri(2, SIGNIFICANCE) * self.sd**2
 
     @property
     def rms_px(self) -> float:
@@ -169,10 +167,10 @@ class Comparison:
     def field_changed(self) -> bool:
         """Whether the field differs in a larger part of the image than by chance.
 
-        By chance, a fraction 1 - LEVEL of the cells exceeds the quantile; the limit is twice
+        By chance, a fraction SIGNIFICANCE of the cells exceeds the quantile; the limit is twice
         that, as cells are correlated.
         """
-        return bool(self.significant.mean() > 2 * (1 - LEVEL))
+        return bool(self.significant.mean() > 2 * SIGNIFICANCE)
 
     @property
     def interior_changed(self) -> bool:
@@ -191,18 +189,14 @@ def compare_calibrations(
     if first.image_size != second.image_size:
         sizes = [f'{w} x {h} px' for w, h in (first.image_size, second.image_size)]
         raise DataError(f'fluoroscope {name}: the images are {sizes[0]} and {sizes[1]}')
-    _, uv = cell_centres(first.image_size, CELLS)
-    fields = at_common_angle(uv, first, second)
-    inside = ~(fields[0].outside | fields[1].outside)
-    if inside.sum() < MIN_PIXELS:
+    uv, corrections = _common(first, second, CELLS)
+    if not len(uv):
         raise DataError(f'fluoroscope {name}: the calibrated areas hardly overlap')
-    uv = uv[inside]
-    parts = [_part(field, inside) for field in fields]
-    compared = _difference(uv, (first.interior, second.interior), parts)
+    compared = _difference(uv, (first.interior, second.interior), corrections)
     covariance = first.interior_covariance + second.interior_covariance
     difference = second.interior - first.interior
     if first.interior_estimated or second.interior_estimated:
-        difference = _interior_difference(uv, (first, second), parts)
+        difference = _interior_difference(uv, (first, second), corrections)
     test, limit = _test(difference, covariance)
     return Comparison(
         name,
@@ -255,4 +249,4 @@ def _test(difference: NDArray[np.float64], covariance: NDArray[np.float64]) -> t
         return float('nan'), float('nan')
     part = difference[free]
     test = float(part @ np.linalg.solve(covariance[np.ix_(free, free)], part))
-    return test, float(chdtri(int(free.sum()), 1 - LEVEL))
+    return test, float(chdtri(int(free.sum()), SIGNIFICANCE))

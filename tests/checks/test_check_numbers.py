@@ -19,12 +19,12 @@ from fluoro_calib_ros.checks.beads import _layers, _sums, rejected_beads
 from fluoro_calib_ros.checks.check import Check, more_exposures, verdict_of
 from fluoro_calib_ros.checks.comparison import (
     CELLS,
+    GRID,
     Comparison,
     FieldDifference,
     _difference,
     _test,
     cell_centres,
-    image_grid,
     place_name,
 )
 from fluoro_calib_ros.checks.drift_charts import (
@@ -569,9 +569,6 @@ def test_misfits_are_of_residuals_over_the_noise_of_each_image_point():
 
 
 def test_grids_lie_evenly_over_the_image():
-    grid = image_grid((480, 240))
-    assert grid[0].tolist() == [9.5, 4.5] and grid[-1].tolist() == [469.5, 234.5]
-    assert grid[1].tolist() == [29.5, 4.5]
     _, cells = cell_centres((640, 320), CELLS)
     assert cells[0].tolist() == [4.5, 4.5] and cells[-1].tolist() == [634.5, 314.5]
     assert len(cells) == 64 * 32
@@ -585,7 +582,7 @@ def test_orientations_absorb_shift_scale_rotation_and_tilt():
 
 
 def test_difference_of_predictions_is_without_gauge_and_signed():
-    uv = image_grid(SIZE)
+    _, uv = cell_centres(SIZE, GRID)
     interior = np.array([511.5, 383.5, 2000.0])
     bump = np.exp(-np.sum((uv - [300, 500]) ** 2, axis=1) / 2 / 40**2)[:, None] * [3.0, -1]
     sd = np.full(len(uv), 0.3)

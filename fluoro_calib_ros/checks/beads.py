@@ -25,6 +25,7 @@ from scipy.special import bdtrc, chdtri, pdtrc
 from ..bodies.body import by_pose
 from ..estimation.rounds import ResidualTable
 from ..findings import Kind, Place, first_few
+from ..photogrammetry.noise import SURE
 from ..photogrammetry.outliers import CONTRADICTION, FALSE_ALARM
 from ..photogrammetry.unknowns import POSE_SIZE
 from .bead_intersection import (
@@ -40,9 +41,6 @@ from .exchanged_beads import exchanged_beads, rate_of
 
 MIN_LAYER = 8  # minimum number of beads in a layer, and outside of it
 BORDERS = 40  # number of borders between layers to try along each axis
-# Minimum gap at a border [sd of the survey's difference of two beads]. In a smaller gap the errors
-# of the survey decide on which side a bead lies, and a layer seems displaced by its selection.
-BORDER_SDS = 3.0
 EXPLAINED = 0.5  # minimum share of the excess sum of squares that a displaced layer explains
 IMPROVED = 2.0  # minimum factor by which the median square of its beads decreases
 
@@ -223,14 +221,16 @@ class _Fit:
 def _layers(coordinate: NDArray[np.float64], sd: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return starts and stops (k, 2) of the layers to try, from sorted coordinates (n,), their sd.
 
-    Borders are at the largest gaps. Of a face and its complement, the smaller one is tried.
+    Borders are at the largest gaps. In a gap of less than SURE standard deviations the errors of
+    the survey decide on which side a bead lies, and a layer seems displaced by its selection. Of a
+    face and its complement, the smaller one is tried.
     """
     count = len(coordinate)
     gap = np.diff(coordinate)
     gaps = np.argsort(-gap, kind='stable')[:BORDERS] + 1
     regular = np.linspace(0, count, BORDERS // 2).astype(int)[1:-1]
     inner = np.concatenate([gaps, regular])
-    is_border = gap > BORDER_SDS * np.hypot(sd[1:], sd[:-1])
+    is_border = gap > SURE * np.hypot(sd[1:], sd[:-1])
     borders = np.unique(np.concatenate([[0, count], inner[is_border[inner - 1]]]))
     pairs = borders[np.stack(np.triu_indices(len(borders), 1), axis=1)]
     size = pairs[:, 1] - pairs[:, 0]

@@ -19,7 +19,7 @@ from ..estimation.rounds import ResidualTable
 from ..exposures.collector import RECOMMENDED_EXPOSURES
 from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place
-from ..photogrammetry.noise import INLIER_Q, NORMAL_MEDIAN
+from ..photogrammetry.noise import CERTAIN, INLIER_Q, NORMAL_MEDIAN
 from .calibration_evidence import Evidence, Subject
 from .check import Check, more_exposures, rms, too_little_data
 from .residual_tests import RejectedExposure, noise_of, residuals_of
@@ -127,11 +127,10 @@ FOLDS = 4
 # Margin over the expectation with RECOMMENDED_EXPOSURES; proportional to 1 / sqrt(exposures).
 MARGIN = 0.13
 EXPOSURE_LIMIT = 1.6  # minimum limit, as a multiple of the expectation
-# Maximum deviation of the worst of many exposures, in robust standard deviations of the logarithms
-# over all exposures; n exposures add SCATTER_OF_FEW / n. If noise differs between exposures, an
-# exposure with much noise is not at fault. But noise also differs between neighbouring image
-# points: an exposure whose neighbours agree has a misfit, whatever the scatter.
-EXPOSURE_SCATTER = 4.0
+# The worst of n exposures may deviate by CERTAIN + SCATTER_OF_FEW / n robust standard deviations,
+# those of the logarithms over all exposures. If noise differs between exposures, an exposure with
+# much noise is not at fault. But noise also differs between neighbouring image points: an exposure
+# whose neighbours agree has a misfit, whatever the scatter.
 SCATTER_OF_FEW = 20.0
 MIN_NOISE = 0.05  # minimum noise share of the squared residuals in sample, whatever the trend
 
@@ -297,7 +296,7 @@ def exposure_limits(ratio: NDArray[np.float64], white: NDArray[np.float64]) -> N
     """
     size = np.log(ratio)
     scatter = np.median(np.abs(size - np.median(size))) / NORMAL_MEDIAN
-    factor = EXPOSURE_SCATTER + SCATTER_OF_FEW / len(ratio)
+    factor = CERTAIN + SCATTER_OF_FEW / len(ratio)
     upper_limit = EXPOSURE_LIMIT * np.maximum(1.0, white)
     return np.clip(np.exp(factor * scatter), EXPOSURE_LIMIT, upper_limit)
 

@@ -34,6 +34,7 @@ from ..exposures.phantom import MISTAKEN_UNITS, Phantom
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.diagnosis import MAX_RELATIVE_SD
+from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
 from ..photogrammetry.rig_orientation import KnownOrientation
@@ -533,11 +534,7 @@ def _are_copied(uv: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
 
 # Maximum RMSE after correction, or displacement between pairs, over the longer image side.
 MAX_MISFIT = 0.0025
-MAX_MISFIT_SD = 4.0  # maximum RMSE over the a-priori standard deviation of the image points
 MAX_DISTANCE_CHANGE = 0.2  # maximum change of a fixed distance by the scale of the correction
-MAX_SD_POINT = 0.15  # maximum sd of the principal point over the longer side of the image
-# maximum distance of the principal point from the middle over the longer side
-MAX_OFF_CENTRE = 1.0
 
 
 def implausible(request: CalibrationRequest, result: CalibrationResult) -> list[Finding]:
@@ -561,7 +558,7 @@ def _large_residuals(figures: FluoroscopeResult, frames: Sequence[Frame]) -> Fin
     sigmas = [np.median(frame.sigma) for frame in frames if frame.sigma is not None]
     limit = MAX_MISFIT * max(figures.image_size)
     if sigmas:
-        limit = max(limit, MAX_MISFIT_SD * float(np.median(sigmas)))
+        limit = max(limit, CERTAIN * float(np.median(sigmas)))
     if rmse <= limit:
         return None
     return Finding(
@@ -601,18 +598,18 @@ def _wrong_interior(
     side = max(figures.image_size)
     if not np.any(sd) and (finding := _wrong_given_distance(calibration)):
         return finding
-    if sd[2] > MAX_RELATIVE_SD * c or max(sd[:2]) > MAX_SD_POINT * side:
+    if max(sd) > MAX_RELATIVE_SD * c:
         return Finding(
             Kind.INTERIOR_UNDETERMINED,
             f'the interior orientation is not determined: principal distance {c:.0f} px with a '
             f'standard deviation of {sd[2]:.0f} px, principal point within {max(sd[:2]):.0f} px',
             numbers={'sd_c_px': float(sd[2]), 'sd_point_px': float(max(sd[:2]))},
         )
-    if _off_centre(figures.interior, figures.image_size) <= MAX_OFF_CENTRE * side:
+    if _off_centre(figures.interior, figures.image_size) <= side:
         return None
     xp, yp, _ = _interior_about_middle(calibration)
     offset = _off_centre(np.array([xp, yp]), figures.image_size)
-    if offset <= MAX_OFF_CENTRE * side:
+    if offset <= side:
         return None
     return Finding(
         Kind.PRINCIPAL_POINT_OFF,

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from .drift_charts import MEMORY, DriftOptions, EpipolarObservations, ImageAreas
 
 LAGS = (1, 2, 4)  # frame lags at which the noise of a marker is compared
-MIN_CORRELATION = 0.05
 MAX_CORRELATION = 0.97  # maximum for the noise of a marker in successive frames
 NUGGET = 0.35  # fraction of the systematic standard deviation that the nodes cannot represent
 
@@ -71,10 +70,11 @@ class PairWatch:
         if not self._count:
             return 1.0
         v1, v2, v4 = self._squares / self._count
-        if v2 - v1 <= 6 * v1 / np.sqrt(self._count):  # three standard deviations: not significant
+        # three standard deviations: not significant
+        if v2 - v1 <= 6 * v1 / np.sqrt(self._count) or v4 <= v2:
             return 1.0
-        r = (np.sqrt(1 + 4 * max(v4 - v2, 0) / (v2 - v1)) - 1) / 2
-        r = float(np.clip(r, MIN_CORRELATION, MAX_CORRELATION))
+        r = (np.sqrt(1 + 4 * (v4 - v2) / (v2 - v1)) - 1) / 2
+        r = min(float(r), MAX_CORRELATION)
         s = min((v2 - v1) / (r * (1 - r)), v1 / (1 - r))
         n = max(self._frames / self._count, 1.0)
         long_run = (1 + r) / (1 - r)

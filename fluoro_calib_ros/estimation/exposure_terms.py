@@ -44,7 +44,7 @@ from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import information_of_additional, solved_additional
-from ..photogrammetry.unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
+from ..photogrammetry.unknowns import INTERIOR_SIZE, POSE_SIZE
 from .estimator import GaugeKind, gauge_basis
 
 TERMS = len(cubic_terms())  # number of terms of the cubic trend without the gauge
@@ -128,7 +128,7 @@ def variation(
         explained += square
         unexplained += float(np.sum(residuals[rows] ** 2)) - square
         dof += a.shape[1]
-        dof_left += len(a) - a.shape[1] - EXTERIOR_SIZE
+        dof_left += len(a) - a.shape[1] - POSE_SIZE
         points += len(a)
     if not dof or unexplained <= 0:
         return Variation(0.0, 0.0, 0.0)
@@ -223,7 +223,6 @@ def without_exposure_terms(
 # variance component by the method of moments (Searle, Casella and McCulloch, "Variance
 # Components", Wiley 1992, chapter 5).
 
-UNUSED = 1e6  # factor of the standard deviation of an outlier, to give it no weight
 NEARLY_FREE = 10.0  # factor of the standard deviations of the survey
 
 
@@ -301,7 +300,7 @@ def _information(
     start[f] = np.zeros(terms.count)
     fixed_network = replace(
         network,
-        sigma=np.where(adjustment.inliers, network.sigma, UNUSED * network.sigma),
+        sigma=np.where(adjustment.inliers, network.sigma, np.inf),  # outliers have no weight
         interior_free=np.zeros(network.n_fluoroscopes, dtype=bool),
         additional=tuple(additional),
     )

@@ -17,7 +17,7 @@ from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
 from ..photogrammetry.diagnosis import global_names
 from ..photogrammetry.elimination import CovarianceBlocks, factorize
-from ..photogrammetry.network import Network
+from ..photogrammetry.network import MIN_RAYS, Network
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import (
@@ -153,11 +153,6 @@ class SolvedNetwork:
         ]
 
 
-# Mean number of image points of a target that estimation of the noise needs: with fewer, the noise
-# cannot be separated from errors of the survey.
-MIN_RAYS_FOR_NOISE = 3
-
-
 def network_of_calibrations(
     frames: Frames,
     phantom: Phantom,
@@ -271,5 +266,8 @@ def start_within_survey(
 
 
 def too_few_rays_for_noise(network: Network) -> bool:
-    """Whether a network has too few rays to estimate the noise; calibrations then give it."""
-    return len(network.uv) < MIN_RAYS_FOR_NOISE * len(network.survey_mm)
+    """Whether a network has too few rays to estimate the noise; calibrations then give it.
+
+    The noise cannot be separated from errors of the survey.
+    """
+    return len(network.uv) < MIN_RAYS * len(network.survey_mm)

@@ -29,7 +29,7 @@ from ..photogrammetry.rig_orientation import (
     KnownOrientation,
 )
 from ..photogrammetry.rotations import rotation_angle
-from ..photogrammetry.unknowns import EXTERIOR_SIZE, RIGID_SD_MM, RIGID_SD_RAD, Parameters
+from ..photogrammetry.unknowns import POSE_SIZE, RIGID_SD_MM, RIGID_SD_RAD, Parameters
 from .priors import Prior
 from .start_orientation import (
     UNTILTED,
@@ -310,7 +310,7 @@ def _exterior_prior(task: _Task, frames: Sequence[Frame]) -> ExteriorPrior:
     """Return the prior of the exterior orientations of exposures."""
     rotation = np.tile(np.eye(3), (len(frames), 1, 1))
     position = np.zeros((len(frames), 3))
-    sd = np.full((len(frames), EXTERIOR_SIZE), np.inf)
+    sd = np.full((len(frames), POSE_SIZE), np.inf)
     for row, frame in enumerate(frames):
         known = task.known.get(frame.fluoroscope)
         if known is not None:

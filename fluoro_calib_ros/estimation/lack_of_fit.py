@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc, log_ndtr
 
@@ -450,12 +451,7 @@ MIN_POINTS = 100  # image points that a profile needs
 # Least gain of deviance, over the dispersion, for a profile. Chance exceeds it in one of 20 images
 # (chi squared with one degree of freedom), with factors that hardly differ from one.
 MIN_GAIN = 4.0
-MIN_SQUARE = 1e-6  # of the mean; avoids the logarithm of zero
 REACH_QUANTILE = 0.99  # quantile of the distances at which a profile ends
-# Fisher scoring: most steps, largest step, and step at convergence.
-MAX_STEPS = 100
-MAX_STEP = 1.0
-MIN_STEP = 1e-6
 
 
 def fitted_profile(
@@ -470,36 +466,34 @@ def fitted_profile(
     if len(uv) < MIN_POINTS or not mean > 0:
         return None
     square = square_distance(uv[:, 0], uv[:, 1], image_size)
-    y = np.maximum(squares / mean, MIN_SQUARE)
-    y /= np.mean(y)
-    slope, expected = _gamma_regression(square, y)
+    y = squares / mean
+    reach = float(np.sqrt(np.quantile(square, REACH_QUANTILE)))
+    limit = 2 * np.log(MAX_FACTOR) / reach**2
+    slope, expected = _gamma_regression(square, y, limit)
     # Two coordinates give chi squared with two degrees of freedom: a dispersion of one.
     dispersion = float(np.mean((y / expected - 1) ** 2))
     gain = -2 * float(np.sum(np.log(expected)))  # of deviance; the mean of y / expected is one
     if gain <= MIN_GAIN * dispersion:
         return None
-    reach = float(np.sqrt(np.quantile(square, REACH_QUANTILE)))
-    limit = 2 * np.log(MAX_FACTOR)
-    growth = float(np.clip(slope * reach**2, -limit, limit))
+    growth = slope * reach**2
     middle = float(np.mean(np.exp(growth * np.minimum(square / reach**2, 1))) ** -0.5)
     return NoiseProfile(middle, middle * float(np.exp(growth / 2)), reach)
 
 
 def _gamma_regression(
-    x: NDArray[np.float64], y: NDArray[np.float64]
+    x: NDArray[np.float64], y: NDArray[np.float64], limit: float
 ) -> tuple[float, NDArray[np.float64]]:
     """Fit the logarithm of the expectation of y (n,) over x (n,); return slope and expectations.
 
-    Fisher scoring: with a logarithmic link, all weights are one (McCullagh and Nelder, 8.4).
+    The score is a decreasing function of the slope, as all weights are one with a logarithmic
+    link (McCullagh and Nelder, 8.4). limit: largest slope.
     """
     x = x - np.mean(x)
-    square = max(float(x @ x), MIN_SQUARE)
-    slope = 0.0
-    for _ in range(MAX_STEPS):
-        expected = np.exp(slope * x)
-        expected *= np.mean(y / expected)
-        step = float(x @ (y / expected)) / square
-        slope += float(np.clip(step, -MAX_STEP, MAX_STEP))
-        if abs(step) < MIN_STEP:
-            break
-    return slope, expected
+
+    def score(slope: float) -> float:
+        return float(x @ (y * np.exp(-slope * x)))
+
+    is_inside = score(-limit) > 0 > score(limit)
+    slope = float(brentq(score, -limit, limit) if is_inside else limit * np.sign(score(0.0)))
+    expected = np.exp(slope * x)
+    return slope, expected * np.mean(y / expected)

@@ -19,13 +19,11 @@ from scipy.special import stdtrit
 
 from ..correction.series import MARGIN, Functions
 from ..exposures.collector import MIN_EXPOSURES
+from ..photogrammetry.noise import CERTAIN
+from ..photogrammetry.outliers import FALSE_ALARM
 
 # Number of sines along the image to search: ripples shorter than 53 px on 1024 px.
 SEARCHED_BANDS = 50
-# Standard deviations by which the mean power of a band with ripples must exceed that of noise.
-SIGNIFICANT = 5.0
-# Chance that ripples which differ between exposures agree in a band.
-FALSE_ALARM = 1e-5
 BESIDE_PEAK = 0.2  # least power of a band of the ripples, relative to the strongest band
 LEAST_EXCESS = 0.1  # least initial power of a band in excess of the noise
 
@@ -119,7 +117,7 @@ def shown_ripples(
     bands = np.arange(len(number))
     # The power of a sine is a mean of two squares and has a standard deviation of one. The image
     # determines only a part of the sines over their rectangle.
-    shown = (excess > SIGNIFICANT * MARGIN / np.sqrt(number)) & (bands > complete)
+    shown = (excess > CERTAIN * MARGIN / np.sqrt(number)) & (bands > complete)
     if shown.any():
         shown[shown] = _are_common(functions, uv, residuals, exposure, bands[shown])
     if not shown.any():
@@ -142,7 +140,8 @@ def _are_common(
     """Whether the ripples of residuals (n, 2) in bands (b,) are common to the exposures (n,).
 
     The products of pairs of exposures are compared with zero by Student's t. Those of different
-    pairs are uncorrelated if the ripples of each exposure have random signs.
+    pairs are uncorrelated if the ripples of each exposure have random signs. FALSE_ALARM is the
+    chance that such ripples agree in any band.
     """
     sums = np.stack(
         [
@@ -153,7 +152,7 @@ def _are_common(
     first, second = np.triu_indices(len(sums), 1)
     if len(sums) < MIN_EXPOSURES:
         return np.zeros(len(bands), dtype=bool)
-    limit = -stdtrit(len(first) - 1, FALSE_ALARM)
+    limit = -stdtrit(len(first) - 1, FALSE_ALARM / SEARCHED_BANDS)
     out = []
     for band in bands:
         band_sums = sums[:, functions.band == band].reshape(len(sums), -1)

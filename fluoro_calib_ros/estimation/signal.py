@@ -50,8 +50,7 @@ START_FINE_SHARE = 0.1  # initial standard deviation of the short field, relativ
 SHOWN_PX = 0.2
 SHOWN_REACH = 0.03
 MAX_STEP = 0.8  # largest step of the logarithm of a standard deviation or length
-STEPS = 4  # steps of Fisher scoring in one update
-RIPPLE_STEPS = 2  # steps of the variances of ripples in one update
+STEPS = 4  # steps of Fisher scoring, and of the variances of ripples, in one update
 MIN_DETERMINED = 1e-3  # least number of determined coefficients in a sum
 # Quadrature over the parameters of the long field, which have these indices. NODE is the distance
 # of the two nodes on an axis from the most likely value [standard deviations], for which the nodes
@@ -351,7 +350,7 @@ def _with_likely_ripples(
     """
     frequency = coefficients.frequency
     band = ripples.band(frequency)
-    for _ in range(RIPPLE_STEPS):
+    for _ in range(STEPS):
         variance = signal.variance(frequency)
         posterior = _posterior(coefficients.of_columns(variance), coefficients)
         if posterior is None:

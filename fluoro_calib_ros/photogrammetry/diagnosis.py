@@ -25,7 +25,7 @@ from .noise import Noise
 from .normal_equations import normal_equations
 from .plane_resection import flatness
 from .precision import Precision
-from .unknowns import EXTERIOR_SIZE, SINGULAR, Parameters
+from .unknowns import POSE_SIZE, SINGULAR, Parameters
 
 # Correlation above which two unknowns are reported.
 HIGH_CORRELATION = 0.95
@@ -114,7 +114,7 @@ def _turned_to_sensor(
     parameters: Parameters, exterior: NDArray[np.float64], mixed: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotate covariances (m, 6, 6) and (m, 6, G) to sources in the sensor frame."""
-    turn = np.tile(np.eye(EXTERIOR_SIZE), (len(exterior), 1, 1))
+    turn = np.tile(np.eye(POSE_SIZE), (len(exterior), 1, 1))
     turn[:, :3, :3] = parameters.rotation
     return turn @ exterior @ turn.transpose(0, 2, 1), turn @ mixed
 

@@ -23,7 +23,7 @@ from scipy.linalg import blas, cho_factor, cho_solve, lapack
 from .network import Gauge, Network, stabilising_factor
 from .normal_equations import NormalEquations
 from .rotations import mirror_lower
-from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ReducedLayout, UnknownVector
+from .unknowns import POINT_SIZE, POSE_SIZE, ReducedLayout, UnknownVector
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ class EliminatePoints(Elimination):
         n = network.n_points
         free = network.layout.free
         border = np.zeros((n, POINT_SIZE, self.layout.size))
-        by_exposure = border[:, :, self.layout.blocks].reshape(n, POINT_SIZE, m, EXTERIOR_SIZE)
+        by_exposure = border[:, :, self.layout.blocks].reshape(n, POINT_SIZE, m, POSE_SIZE)
         by_exposure[network.point, :, network.exposure, :] = equations.pe
         border[:, :, self.layout.globals] = equations.pg[:, :, free]
         remaining = self._remaining_matrix(equations.ee, equations.eg, equations)
@@ -281,9 +281,7 @@ class EliminatePoints(Elimination):
         self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
     ) -> UnknownVector:
         """Return object points (n, 3, ...) and remaining unknowns (q, ...) by kind."""
-        exteriors = x_remaining[self.layout.blocks].reshape(
-            -1, EXTERIOR_SIZE, *x_remaining.shape[1:]
-        )
+        exteriors = x_remaining[self.layout.blocks].reshape(-1, POSE_SIZE, *x_remaining.shape[1:])
         return UnknownVector(exteriors, x_blocks, self._globals_of(x_remaining))
 
     def right_side_of_points(
@@ -354,7 +352,7 @@ class EliminateExposures(Elimination):
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return right sides of cells (k, s), and of points and free globals (q,)."""
-        cell_right = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
+        cell_right = np.zeros((self.n_cells, self.n_places, POSE_SIZE))
         cell_right[self.cell, self.place] = right.exteriors
         free = self.network.layout.free
         remaining = np.concatenate([right.points.ravel(), right.globals[free]])
@@ -364,7 +362,7 @@ class EliminateExposures(Elimination):
         """Return blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
         cell = self.cell
         place = self.place
-        shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
+        shape = (self.n_cells, self.n_places, POSE_SIZE)
         blocks = np.zeros((*shape, *shape[1:]))
         diagonal = np.einsum('kiaia->kia', blocks)  # a view
         diagonal[...] = 1
@@ -372,13 +370,13 @@ class EliminateExposures(Elimination):
         a, b = equations.coupled_pairs.T
         blocks[cell[a], place[a], :, place[b], :] = equations.coupled
         blocks[cell[a], place[b], :, place[a], :] = equations.coupled.transpose(0, 2, 1)
-        width = EXTERIOR_SIZE * self.n_places
+        width = POSE_SIZE * self.n_places
         return blocks.reshape(self.n_cells, width, width)
 
     def _cell_border(self, equations: NormalEquations) -> NDArray[np.float64]:
         """Return mixed blocks (k, s, q) of the cells with points and global unknowns."""
         network = self.network
-        shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
+        shape = (self.n_cells, self.n_places, POSE_SIZE)
         border = np.zeros((*shape, self.layout.size))
         by_point = border[..., self.layout.blocks].reshape(*shape, network.n_points, POINT_SIZE)
         cell = self.cell[network.exposure]
@@ -386,7 +384,7 @@ class EliminateExposures(Elimination):
         by_point[cell, place, :, network.point, :] = equations.pe.transpose(0, 2, 1)
         free = network.layout.free
         border[self.cell, self.place, :, self.layout.globals] = equations.eg[:, :, free]
-        return border.reshape(self.n_cells, EXTERIOR_SIZE * self.n_places, -1)
+        return border.reshape(self.n_cells, POSE_SIZE * self.n_places, -1)
 
     def to_unknowns(
         self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
@@ -402,7 +400,7 @@ class EliminateExposures(Elimination):
         columns = values.shape[2]
         remaining = np.zeros((self.layout.size, columns))
         remaining[self.layout.blocks] = values.reshape(-1, columns)
-        return np.zeros((self.n_cells, EXTERIOR_SIZE * self.n_places, columns)), remaining
+        return np.zeros((self.n_cells, POSE_SIZE * self.n_places, columns)), remaining
 
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Return covariances of exposures from the cells, of points from the remaining part."""
@@ -412,7 +410,7 @@ class EliminateExposures(Elimination):
         cell = self.cell
         place = self.place
         rows = self.layout.block_rows
-        shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
+        shape = (self.n_cells, self.n_places, POSE_SIZE)
         blocks = covariance.blocks.reshape(*shape, *shape[1:])
         conditional = covariance.conditional.reshape(*shape, *shape[1:])
         gain = covariance.gain.reshape(*shape, self.layout.size)
@@ -437,7 +435,7 @@ class EliminateExposures(Elimination):
 
     def _of_exposures(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return values (m, 6, ...) of the exposures from those of their cells (k, s, ...)."""
-        shape = (self.n_cells, self.n_places, EXTERIOR_SIZE, *values.shape[2:])
+        shape = (self.n_cells, self.n_places, POSE_SIZE, *values.shape[2:])
         return values.reshape(shape)[self.cell, self.place]
 
 

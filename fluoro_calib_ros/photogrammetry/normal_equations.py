@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from .network import Gauge, Network, open_gauge
 from .noise import Noise
 from .unknowns import (
-    EXTERIOR_SIZE,
     POSE_SIZE,
     Parameters,
     UnknownVector,
@@ -301,7 +300,7 @@ def normal_equations(
     blocks.add_interiors(parameters, sums)
     coupled_pairs, coupled = _add_relative(parameters, ee, e, blocks)
     if network.exterior is not None:
-        diagonal = np.arange(EXTERIOR_SIZE)
+        diagonal = np.arange(POSE_SIZE)
         ee[:, diagonal, diagonal] += network.exterior.weights
         e += _exterior_pull(network, parameters)
     if sums.linearised:
@@ -415,7 +414,7 @@ class _GlobalBlocks:
         return cls(
             network,
             np.zeros((size, size)),
-            np.zeros((network.n_exposures, EXTERIOR_SIZE, size)),
+            np.zeros((network.n_exposures, POSE_SIZE, size)),
             np.zeros((network.n_points, 3, size)),
             np.zeros(size),
         )

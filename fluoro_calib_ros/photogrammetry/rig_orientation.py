@@ -27,10 +27,10 @@ from .rotations import (
     quaternion_from_matrix,
     vector_from_matrix,
 )
-from .unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
+from .unknowns import INTERIOR_SIZE, POSE_SIZE
 
 # Unknowns of a fluoroscope: T [mm], w [rad], xp, yp, c [px].
-ORIENTATION_SIZE = EXTERIOR_SIZE + INTERIOR_SIZE
+ORIENTATION_SIZE = POSE_SIZE + INTERIOR_SIZE
 SOURCES = ('capture', 'joint calibration', 'healing')
 # Largest rounding error: of a rotation matrix (from orthogonality), of the symmetry of a
 # correlation matrix, and of an eigenvalue.

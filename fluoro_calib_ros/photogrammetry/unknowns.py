@@ -27,7 +27,9 @@ from numpy.typing import NDArray
 
 from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
 
-POSE_SIZE = 6  # translation [mm], rotation vector [rad], also of a body in the rig frame
+# Source or translation [mm], and rotation vector [rad]: of an exposure, of a relative orientation,
+# or of a body in the rig frame.
+POSE_SIZE = 6
 # Standard deviations for a rigid mounting, or a fixed orientation: a thousandth of what one pair
 # of exposures determines from images with 0.25 px noise. The solution differs from the limit by
 # some 1e-5 standard deviations, and rounding errors are still negligible.
@@ -75,7 +77,6 @@ class RelativePose:
         )
 
 
-EXTERIOR_SIZE = 6  # source T [mm], rotation vector w [rad]
 POINT_SIZE = 3  # coordinates [mm]
 INTERIOR_SIZE = 3  # xp, yp, c [px]
 
@@ -181,7 +182,7 @@ class UnknownLayout:
     @property
     def n_unknowns(self) -> int:
         """Number of scalar unknowns, less those that the datum of a free network fixes."""
-        blocks = EXTERIOR_SIZE * self.n_exposures + POINT_SIZE * self.n_points
+        blocks = POSE_SIZE * self.n_exposures + POINT_SIZE * self.n_points
         return blocks + self.n_free_globals - self.datum_defect
 
     @property
@@ -202,7 +203,7 @@ class UnknownLayout:
     @cached_property
     def without_points(self) -> ReducedLayout:
         """Order of the unknowns after the elimination of the object points."""
-        return ReducedLayout(self.n_exposures, EXTERIOR_SIZE, self.n_free_globals)
+        return ReducedLayout(self.n_exposures, POSE_SIZE, self.n_free_globals)
 
     @cached_property
     def without_exposures(self) -> ReducedLayout:

@@ -32,19 +32,10 @@ from .unknowns import Parameters, discrepancies
 
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-12
-# A refused step ends the adjustment if it predicts a decrease below this part of the tolerance, or
-# below NEGLIGIBLE_DECREASE (or a smaller tolerance): rounding errors then hide the decrease.
-NEGLIGIBLE = 1e-3
-NEGLIGIBLE_DECREASE = 1e-6
-# Image points from which repeated steps with the last normal matrix save time. With additional
-# parameters they always do.
-LARGE = 5_000
 UNDAMPED = 1e-6  # damping that changes no covariance visibly
 # A step with the same normal matrix saves time if it predicts less than this part of the last
-# decrease of F; REPEATED_SLOW: if new matrices converge no faster, as with heavy tails.
+# decrease of F.
 REPEATED = 0.5
-REPEATED_SLOW = 0.9
-SLOWER = 1.2  # rate of convergence, relative to that of new normal matrices
 # Largest decrease of F for each image point by a step with the last normal matrix: larger steps
 # change the weights of the image points.
 REPEATED_DECREASE = 0.01
@@ -177,13 +168,6 @@ class _Problem:
         equations = normal_equations(self.network, parameters, self.correction, self.noise)
         return self.elimination.bordered_system(equations)
 
-    @property
-    def is_large(self) -> bool:
-        """Whether right sides take a small part of the time of normal equations."""
-        network = self.network
-        has_additional = any(parameters is not None for parameters in network.additional)
-        return has_additional or network.n_image_points >= LARGE
-
     def factorize(self, system: BorderedSystem, mu: float) -> _Solver:
         """Factorize normal equations that are damped by mu.
 
@@ -268,7 +252,6 @@ class _LevenbergMarquardt:
         self._last: _Solver | None = None  # solver of the last step, if it may be used again
         self.used: _Solver | None = None
         self._predicted = np.inf  # decrease of F by the last accepted step
-        self._rate = 0.0  # ratio of the last two such decreases, at the last new normal matrix
 
     def step(self) -> None:
         """Take or refuse one damped step."""
@@ -287,15 +270,14 @@ class _LevenbergMarquardt:
             return
         trial = self._problem.after(self.current, step)
         if self._is_worse(trial):
-            self.converged = self._is_negligible(step.predicted)
+            self.converged = step.predicted <= self._tolerance
             if self.converged:
                 self._use(solver)
             self.finished = self.converged or self._damping.refuse()
             return
         self._damping.accept((self.current.cost - trial.cost) / max(step.predicted, 1e-300))
         self._use(solver)
-        self._last = self.used if self._problem.is_large else None
-        self._rate = step.predicted / self._predicted
+        self._last = self.used
         self._accept(trial, step.predicted)
 
     def _use(self, solver: _Solver) -> None:
@@ -312,14 +294,13 @@ class _LevenbergMarquardt:
         """
         solver = self._problem.at(self.current.parameters, solver)
         step = self._problem.step(solver)
-        slow_rate = min(SLOWER * self._rate, REPEATED_SLOW)
         limit = REPEATED_DECREASE * self._problem.network.n_image_points
         # If an exposure had almost no weight, the step may be of any size, even infinite.
-        if not step.predicted <= min(max(REPEATED, slow_rate) * self._predicted, limit):
+        if not step.predicted <= min(REPEATED * self._predicted, limit):
             return False
         trial = self._problem.after(self.current, step)
         if self._is_worse(trial):
-            self.converged = self._is_negligible(step.predicted)
+            self.converged = step.predicted <= self._tolerance
             self.finished = self.converged
             return self.converged
         self._accept(trial, step.predicted)
@@ -327,10 +308,6 @@ class _LevenbergMarquardt:
 
     def _is_worse(self, trial: _Iterate) -> bool:
         return not trial.cost <= self.current.cost + ROUNDING * abs(self.current.cost)
-
-    def _is_negligible(self, predicted: float) -> bool:
-        limit = min(self._tolerance, NEGLIGIBLE_DECREASE)
-        return predicted <= max(limit, NEGLIGIBLE * self._tolerance)
 
     def _accept(self, trial: _Iterate, predicted: float) -> None:
         self.current = trial

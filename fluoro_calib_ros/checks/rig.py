@@ -39,10 +39,6 @@ from .inputs import MAX_MISFIT
 
 # Distance, angle [rad] plus relative shift, above which a pair does not belong to the rig.
 INTERCHANGED = 0.4
-# Maximum median deviation of the pairs from their median, far above that of a compliant mounting.
-MAX_SHIFT_MM = 10.0
-MAX_SHIFT = 0.01  # maximum over the distance of the sources; the larger of both limits applies
-MAX_TURN_RAD = np.deg2rad(1.0)
 # Scatter of the pairs over their standard deviations above which they are doubtful; in correct
 # rigs it is 1.0 to 1.4, and 3 if the model does not follow the distortion at all.
 DOUBTFUL_GROWTH = 2.0
@@ -116,41 +112,6 @@ def _distances(
     return angle + distance / np.maximum(length, 1e-9)
 
 
-def contradiction(
-    names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult
-) -> Finding | None:
-    """Return a finding if the exposures of two fluoroscopes contradict each other.
-
-    Exposures of the same number belong together. Fewer than MIN_EXPOSURES pairs cannot contradict.
-    """
-    pairs = _pairs(one, other)
-    if len(pairs) < MIN_EXPOSURES:
-        return None
-    turn, shift = _relative(pairs)
-    deviation = np.linalg.norm(shift - np.median(shift, axis=0), axis=1)
-    middle = int(np.argmin(deviation))
-    off_mm = float(np.median(deviation))
-    off_rad = float(np.median(rotation_angle(turn @ turn[middle].T)))
-    limit = max(MAX_SHIFT_MM, MAX_SHIFT * float(np.median(np.linalg.norm(shift, axis=1))))
-    if off_mm <= limit and off_rad <= MAX_TURN_RAD:
-        return None
-    a, b = names
-    turn_deg = float(np.rad2deg(off_rad))
-    return Finding(
-        Kind.PAIRS_CONTRADICT,
-        f'the exposures of fluoroscopes {a} and {b} contradict each other: the relative '
-        f'orientation differs by {off_mm:.0f} mm and {turn_deg:.1f} degrees; frames with the '
-        'same number are from different exposures, or a fluoroscope was moved',
-        Place(names, name=NOT_ORIENTED),
-        severity=Severity.WARNING,
-        numbers={
-            'shift_mm': off_mm,
-            'turn_deg': turn_deg,
-            'ratio': max(off_mm / limit, off_rad / MAX_TURN_RAD),
-        },
-    )
-
-
 def doubtful(
     scatter: PairScatter, side_px: int, noise_px: float, correction_px: float = 0.0
 ) -> tuple[bool, list[Finding]]:
@@ -213,12 +174,15 @@ def _limit_px(scatter: PairScatter, noise_px: float, correction_px: float) -> fl
     orientation takes over all of them, with the standard deviation correction_px.
     """
     off_px = float(np.median(scatter.off_px[scatter.used]))
-    predicted = off_px / max(scatter.unexplained, 1.0)
+    # Where targets come to lie behind the source, the displacement is infinite.
+    predicted = off_px / max(scatter.unexplained, 1.0) if np.isfinite(off_px) else 0.0
     return max(noise_px, DOUBTFUL_GROWTH * float(np.hypot(predicted, correction_px)))
 
 
 def _px(displacement: float) -> str:
     """Return a displacement as text, with two digits where it is small."""
+    if not np.isfinite(displacement):
+        return 'more than the image shows'
     return f'{displacement:.2g} px' if displacement < 1 else f'{displacement:.1f} px'
 
 
@@ -226,7 +190,7 @@ def _size(off_px: NDArray[np.float64]) -> str:
     """Return displacements of image points as text."""
     low, high = float(np.min(off_px)), float(np.max(off_px))
     if not np.isfinite(high):
-        return f'{_px(low)} and more' if np.isfinite(low) else 'more than the image shows'
+        return f'{_px(low)} and more' if np.isfinite(low) else _px(low)
     from_low = _px(low).removesuffix(' px')
     return _px(low) if high - low < 0.05 else f'{from_low} to {_px(high)}'
 
@@ -323,12 +287,6 @@ def rig_findings(
         known = request.known_orientations
         return RigFindings((), orientation_of_known(known, figures, result.calibrations))
     noise = max(calibration.image_sd for calibration in calibrations.values())
-    adjusted = [name for name in names if name in figures]
-    for name in adjusted[1:]:
-        first = adjusted[0]
-        finding = contradiction((first, name), figures[first], figures[name])
-        if finding is not None:
-            return RigFindings(names, None, (finding,), noise_px=noise)
     try:
         orientation, scatter = orientation_and_scatter(
             {name: frames[name] for name in names},
@@ -378,19 +336,7 @@ def check_rig(findings: RigFindings) -> list[Check]:
         return []
     if not findings.scatter:
         (doubt,) = findings.doubts
-        contradicts = doubt.kind is Kind.PAIRS_CONTRADICT
-        return [
-            Check(
-                Kind.ORIENTATION,
-                doubt.cause,
-                doubt.place,
-                doubt.advice or CAPTURE,
-                numbers=doubt.numbers,
-                value=doubt.numbers['ratio'] if contradicts else np.nan,
-                limit=1.0 if contradicts else np.nan,
-                unit='largest of a rig' if contradicts else '',
-            )
-        ]
+        return [Check(Kind.ORIENTATION, doubt.cause, doubt.place, doubt.advice or CAPTURE)]
     corrections = findings.correction_px or (0.0,) * len(findings.scatter)
     return [_check(findings, pairs, sd) for pairs, sd in zip(findings.scatter, corrections)]
 

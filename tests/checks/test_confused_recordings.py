@@ -166,15 +166,19 @@ def test_frames_of_b_that_are_late_while_the_phantom_moves_fail_the_check():
 
 
 def test_frames_of_other_exposures_fail_and_frames_without_partner_cannot_tell():
-    def numbered(shift):
+    def numbered(shift, sign=1):
+        of_b = frames()['b']
         return {
             'a': frames()['a'],
-            'b': [replace(frame, number=frame.number + shift) for frame in frames()['b']],
+            'b': [replace(frame, number=sign * frame.number + shift) for frame in of_b],
         }
 
-    found, check = of_rig(numbered(1))
-    assert found.orientation is None and check.passed is False
-    assert check.kind is Kind.ORIENTATION and check.value == check.numbers['ratio'] > check.limit
+    last = max(frame.number for frame in frames()['b'])
+    for late in (numbered(1), numbered(-2), numbered(last + 1, -1)):
+        found, check = of_rig(late)
+        assert found.orientation is None and check.passed is False
+        assert check.kind is Kind.ORIENTATION and check.value > check.limit < 1
+        assert check.numbers['ratio'] > 100 and kinds(found.doubts) == [Kind.PAIRS_CONTRADICT]
     found, check = of_rig(numbered(100))
     assert found.orientation is None and check.passed is None
     assert check.kind is Kind.ORIENTATION and np.isnan([check.value, check.limit]).all()

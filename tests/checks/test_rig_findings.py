@@ -15,7 +15,6 @@ from fluoro_calib_ros.checks.rig import (
     ORIENTED,
     RigFindings,
     check_rig,
-    contradiction,
     doubtful,
     interchanged,
     rig_findings,
@@ -69,58 +68,6 @@ def test_interchanged_frames_are_named_by_their_exposures():
     shifts[3] = 900.0
     assert interchanged(('a', 'b'), *poses(range(8), shifts)) is None
     assert interchanged(('a', 'b'), *swapped(*poses((1, 2)), (2,))) is None
-
-
-@pytest.mark.parametrize(
-    ('shift_mm', 'turn_deg', 'ratio'),
-    [
-        (0.0, 0.0, None),
-        (10.6, 0.9, None),
-        (11.4, 0.0, 11.4 / (0.01 * np.linalg.norm(BASE_MM))),
-        (40.0, 0.5, 40.0 / (0.01 * np.linalg.norm(BASE_MM))),
-        (0.0, 1.1, 1.1),
-        (15.0, 3.0, 3.0),
-    ],
-)
-def test_pairs_contradict_from_a_hundredth_of_their_distance_or_a_degree(
-    shift_mm, turn_deg, ratio
-):
-    """The median counts: most pairs deviate by this amount, in alternating directions."""
-    signs = np.array([1, -1, 1, -1, 0, 1, -1, 1, -1])
-    one, other = poses(range(9), shift_mm * signs, np.deg2rad(turn_deg) * signs)
-    found = contradiction(('a', 'b'), one, other)
-    if ratio is None:
-        assert found is None
-        return
-    assert (found.kind, found.severity) == (Kind.PAIRS_CONTRADICT, Severity.WARNING)
-    assert found.numbers['shift_mm'] == pytest.approx(shift_mm, abs=1e-6)
-    assert found.numbers['turn_deg'] == pytest.approx(turn_deg, abs=1e-6)
-    assert found.numbers['ratio'] == pytest.approx(ratio, rel=0.01)
-    assert found.place == Place(('a', 'b'), name=NOT_ORIENTED)
-
-
-def test_three_pairs_may_contradict_each_other():
-    shifts = 90.0 * np.array([1, -1, 3])
-    assert contradiction(('a', 'b'), *poses(range(3), shifts)).numbers['shift_mm'] > 80
-    assert contradiction(('a', 'b'), *poses(range(2), shifts[:2])) is None
-    assert interchanged(('a', 'b'), *swapped(*poses(range(3)), (1,))).place.exposures == (1,)
-
-
-def test_fluoroscopes_near_each_other_may_be_off_by_a_centimetre():
-    signs = np.array([1, -1, 1, -1, 0, 1, -1])
-    for shift_mm, is_found in ((9.9, False), (10.1, True)):
-        one, other = poses(range(7), shift_mm * signs)
-        for a, b in zip(one.exposures, other.exposures):
-            b.position_mm = a.position_mm + 0.2 * (b.position_mm - a.position_mm)
-        found = contradiction(('a', 'b'), one, other)
-        assert found is None  # the distance scales the shift down to a fifth
-        for a, b, sign in zip(one.exposures, other.exposures, signs):
-            b.position_mm = a.position_mm + [100.0 + sign * shift_mm, 0, 0]
-            a.quaternion_wxyz = b.quaternion_wxyz = np.array([1.0, 0, 0, 0])
-        found = contradiction(('a', 'b'), one, other)
-        assert (found is not None) is is_found
-    few = (Fake(exposures=side.exposures[:2]) for side in poses(range(7), 90.0 * signs))
-    assert contradiction(('a', 'b'), *few) is None
 
 
 # ---- scatter of pairs
@@ -218,10 +165,17 @@ def test_check_of_a_rig_is_the_scatter_of_each_pair_against_noise_and_prediction
     assert (of_b.cause, of_b.advice, of_b.limit) == ('why', rig.CAPTURE, 9.0)
 
 
-def test_check_of_a_rig_without_orientation_has_the_ratio_of_what_contradicts():
-    given = finding(Kind.PAIRS_CONTRADICT, ratio=2.5)
-    (check,) = check_rig(RigFindings(('a', 'b'), None, (given,)))
-    assert (check.value, check.limit, check.passed) == (2.5, 1.0, False)
+def test_targets_behind_the_source_of_a_pair_fail_the_check():
+    for off_px in (400.0, np.inf):
+        pairs = scatter(off_px=off_px, unexplained=1758.0)
+        usable, (doubt,) = doubtful(pairs, 1000, 0.25, 0.1)
+        assert not usable and doubt.kind is Kind.PAIRS_CONTRADICT
+        assert ('more than the image shows' in doubt.cause) == np.isinf(off_px)
+        (check,) = check_rig(RigFindings(('a', 'b'), None, (doubt,), (pairs,), noise_px=0.25))
+        assert check.passed is False and check.value == off_px and check.limit < 1
+
+
+def test_check_of_a_rig_without_orientation_cannot_tell():
     (check,) = check_rig(RigFindings(('a', 'b'), None, (finding(Kind.RIG_NOT_ORIENTED),)))
     assert np.isnan([check.value, check.limit]).all() and check.passed is None
     assert check.unit == '' and check.advice == rig.CAPTURE
@@ -323,16 +277,11 @@ def test_a_difference_that_matters_does_not_read_zero(off_px, text):
     assert text in found.cause and '3.0 times' in found.cause
 
 
-def test_rig_without_pairs_or_with_contradicting_ones_says_why(monkeypatch):
+def test_rig_without_pairs_says_why(monkeypatch):
     found, _ = findings_of(monkeypatch, DataError('too few'))
     (doubt,) = found.doubts
     assert found.orientation is None and doubt.kind is Kind.RIG_NOT_ORIENTED
     assert doubt.cause == f'{NOT_ORIENTED}: too few' and found.noise_px == pytest.approx(0.3)
-    signs = np.array([1, -1, 1, -1, 0, 1, -1])
-    figures = dict(zip('ab', poses(range(7), 90.0 * signs)))
-    found, asked = findings_of(monkeypatch, [scatter()], figures)
-    assert kinds(found.doubts) == [Kind.PAIRS_CONTRADICT] and not asked
-    assert found.orientation is None and found.scatter == ()
 
 
 def test_known_orientations_are_taken_where_all_are_known(monkeypatch):

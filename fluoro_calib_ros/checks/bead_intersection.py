@@ -17,6 +17,7 @@ from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.network import MIN_RAYS, similarity_directions
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion
+from ..rows import chosen_rows
 
 STEPS_L1 = 12  # iterations that minimise residual lengths (L1)
 STEPS_L2 = 6  # iterations of least squares
@@ -37,8 +38,7 @@ class Beads:
 
     def without(self, target_id: NDArray[np.int64]) -> Beads:
         """Return the beads except those with a target id."""
-        is_kept = ~np.isin(self.target_id, target_id)
-        return Beads(*(getattr(self, name)[is_kept] for name in self.__dataclass_fields__))
+        return chosen_rows(self, ~np.isin(self.target_id, target_id))
 
     @property
     def misclosure(self) -> NDArray[np.float64]:
@@ -115,9 +115,7 @@ def least_chi2_without_a_ray(
         count = len(bead_rays)
         # One copy of the bead for each excluded ray.
         copy, remaining = np.nonzero(~np.eye(count, dtype=bool))
-        part = Rays(
-            *(getattr(rays, name)[bead_rays[remaining]] for name in rays.__dataclass_fields__)
-        )
+        part = chosen_rows(rays, bead_rays[remaining])
         start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target)]
         ids = np.full(count, target)
         beads = _beads(part, ids, copy, np.tile(start, (count, 1)), phantom)

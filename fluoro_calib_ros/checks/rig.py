@@ -27,7 +27,7 @@ from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibr
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..estimation.pair_scatter import MOVED_SHARE, PairScatter, steps_of
-from ..estimation.result import CalibrationResult, ExposureResult, FluoroscopeResult
+from ..estimation.result import CalibrationResult, FluoroscopeResult
 from ..estimation.rig_orientation import orientation_and_scatter, orientation_of_known
 from ..exposures.collector import MIN_EXPOSURES, displacement
 from ..exposures.frame import Frame, Frames
@@ -56,11 +56,15 @@ def interchanged(
 
     The relative orientation of such a pair is far from the others, while its inverse is near them.
     """
-    pairs = _pairs(one, other)
+    by_number = {e.exposure: e for e in other.exposures}
+    pairs = [(e, by_number[e.exposure]) for e in one.exposures if e.exposure in by_number]
     if len(pairs) < MIN_EXPOSURES:
         return None
-    turn, shift = _relative(pairs)
-    numbers = [a.exposure for a, _ in pairs]
+    numbers = [e.exposure for e, _ in pairs]
+    r_a, r_b = (matrix_from_quaternion([e.quaternion_wxyz for e in side]) for side in zip(*pairs))
+    between = np.array([b.position_mm - a.position_mm for a, b in pairs])
+    turn = r_b @ r_a.transpose(0, 2, 1)
+    shift = (r_a @ between[..., None])[..., 0]
     middle = int(np.argmin(np.median(_distances(turn, shift, turn, shift), axis=1)))
     mean_turn = turn[middle : middle + 1]
     base = shift[middle : middle + 1]
@@ -79,24 +83,6 @@ def interchanged(
         f'{"s" * (len(swapped) > 1)} {", ".join(map(str, swapped))}'
     )
     return Finding(Kind.FLUOROSCOPES_INTERCHANGED, cause, Place(names, swapped, name=''))
-
-
-def _pairs(
-    one: FluoroscopeResult, other: FluoroscopeResult
-) -> list[tuple[ExposureResult, ExposureResult]]:
-    """Return pairs of exposures with the same number."""
-    by_number = {e.exposure: e for e in other.exposures}
-    return [(e, by_number[e.exposure]) for e in one.exposures if e.exposure in by_number]
-
-
-def _relative(
-    pairs: Sequence[tuple[ExposureResult, ExposureResult]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotations (k, 3, 3) from sensor to sensor and shifts (k, 3) [mm] in the first."""
-    r_a = matrix_from_quaternion([a.quaternion_wxyz for a, _ in pairs])
-    r_b = matrix_from_quaternion([b.quaternion_wxyz for _, b in pairs])
-    base = np.array([b.position_mm - a.position_mm for a, b in pairs])
-    return r_b @ r_a.transpose(0, 2, 1), (r_a @ base[..., None])[..., 0]
 
 
 def _distances(

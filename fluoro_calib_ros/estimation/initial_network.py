@@ -226,6 +226,20 @@ class _Task:
         """Return the number of targets that an exposure needs."""
         return 1 if name in self.known else MIN_TARGETS_OF_EXPOSURE
 
+    def xyz(self, frame: Frame) -> NDArray[np.float64]:
+        """Return the surveyed coordinates (n, 3) [mm] of the targets of a frame."""
+        return self.phantom.xyz_mm[self.phantom.index(frame.target_id)]
+
+    def uv(self, name: str, frame: Frame) -> NDArray[np.float64]:
+        """Return the image points (n, 2) [px] of a frame, corrected if the correction is known."""
+        return (
+            frame.uv if self.sensors is None else frame.uv - self.sensors[name].correction(frame)
+        )
+
+    def interior(self, name: str, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the interior orientation (3,) [px] if it is known, else the initial values."""
+        return start if self.sensors is None else np.asarray(self.sensors[name].interior)
+
 
 @dataclass(frozen=True)
 class _Resected:
@@ -359,26 +373,16 @@ def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
     )
 
 
-def _no_correction(frame: Frame) -> NDArray[np.float64]:
-    return np.zeros_like(frame.uv)
-
-
 def _place_all(
     task: _Task, name: str, frames: Sequence[Frame]
 ) -> tuple[list[Resection | None], NDArray[np.float64], list[Finding]]:
     """Use the known orientation for all frames of one fluoroscope; returns as `_resect_all`."""
     known = task.known[name]
-    sensor = None if task.sensors is None else task.sensors[name]
-    correction = _no_correction if sensor is None else sensor.correction
-    interior = known.interior if sensor is None else np.asarray(sensor.interior)
-    resections: list[Resection | None] = []
-    for frame in frames:
-        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
-        resections.append(
-            resection_at(
-                known.rotation, known.position_mm, xyz, frame.uv - correction(frame), interior
-            )
-        )
+    interior = task.interior(name, known.interior)
+    pose = known.rotation, known.position_mm
+    resections: list[Resection | None] = [
+        resection_at(*pose, task.xyz(frame), task.uv(name, frame), interior) for frame in frames
+    ]
     return resections, interior, _reject_poor_fits(frames, resections)
 
 
@@ -387,22 +391,17 @@ def _start_all(
 ) -> tuple[list[Resection | None], NDArray[np.float64], list[Finding]]:
     """Use the given initial values for the frames of one fluoroscope; returns as `_resect_all`."""
     assert task.starts is not None
-    sensor = None if task.sensors is None else task.sensors[name]
     earlier = task.starts.earlier
-    correction = _no_correction if sensor is None else sensor.correction
-    interior = task.starts.interior[name] if sensor is None else np.asarray(sensor.interior)
+    interior = task.interior(name, task.starts.interior[name])
     resections: list[Resection | None] = []
     for frame in frames:
-        rotation, position = task.starts.exterior[name, frame.number]
-        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
-        if sensor is None and earlier is not None:
+        pose = task.starts.exterior[name, frame.number]
+        xyz = task.xyz(frame)
+        if task.sensors is None and earlier is not None:
             uv = frame.uv - earlier.series[name].predict(frame.uv)
-            resections.append(resection_at(rotation, position, xyz, uv, interior))
-            continue
-        # The sensor may have another gauge than the earlier adjustment.
-        resections.append(
-            refine_resection(xyz, frame.uv - correction(frame), interior, rotation, position)
-        )
+            resections.append(resection_at(*pose, xyz, uv, interior))
+        else:  # the sensor may have another gauge than the earlier adjustment
+            resections.append(refine_resection(xyz, task.uv(name, frame), interior, *pose))
     return resections, interior, _reject_poor_fits(frames, resections)
 
 
@@ -413,7 +412,7 @@ def _are_untilted(
     for frame, resection in zip(frames, resections):
         if resection is None:
             continue
-        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        xyz = task.xyz(frame)
         if (
             flatness(xyz) >= MIN_FLATNESS
             or tilt_of(resection.rotation, plane_of(xyz)) > UNTILTED_RAD
@@ -491,19 +490,14 @@ def _resect_all(
     Returns the resections, None for each failure; the interior orientation (3,); and a finding for
     each failure.
     """
-    sensor = None if task.sensors is None else task.sensors[name]
-    correction = _no_correction if sensor is None else sensor.correction
-    views = []
-    for frame in frames:
-        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
-        views.append(view_of(frame, xyz, frame.uv - correction(frame)))
+    views = [view_of(frame, task.xyz(frame), task.uv(name, frame)) for frame in frames]
     excluded = [_not_oriented(view.frame, view.error) for view in views if view.error]
     if len(excluded) == len(views):
         raise DataError(excluded[0])
-    if sensor is None:
+    if task.sensors is None:
         interior = _start_interior(task, name, [view for view in views if not view.error])
     else:
-        interior = np.asarray(sensor.interior)
+        interior = np.asarray(task.sensors[name].interior)
     resections: list[Resection | None] = []
     for view in views:
         try:
@@ -511,7 +505,7 @@ def _resect_all(
         except DataError as error:
             resections.append(None)
             excluded.append(_not_oriented(view.frame, error.finding))
-    if sensor is None:
+    if task.sensors is None:
         resections = settle_planes(views, resections, interior)
     excluded += _reject_poor_fits(frames, resections)
     return resections, interior, excluded

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -273,9 +274,7 @@ def precision(
     fisher = weighted if factor == 1.0 else blocks_at(factor)
     layout = network.layout
     return Precision(
-        interior=np.stack([fisher.gg[columns, columns] for columns in layout.interiors]),
-        exterior=fisher.ee,
-        points=fisher.pp,
+        **_covariances(network, fisher),
         residual=residual,
         redundancy=redundancy,
         survey_redundancy=survey,
@@ -285,12 +284,22 @@ def precision(
         ),
         relative=tuple(fisher.gg[columns, columns] for columns in layout.relative),
         relative_redundancy=_relative_redundancy(network, adjustment.parameters, weighted),
-        all_global=fisher.gg,
-        exterior_global=fisher.eg,
-        joint_points=(
-            joint_covariance(fisher).points if network.n_points <= MAX_JOINT_POINTS else None
-        ),
     )
+
+
+def _covariances(network: Network, blocks: CovarianceBlocks) -> dict[str, Any]:
+    """Return the covariances of the unknowns, which are fields of a `Precision`."""
+    few_points = network.n_points <= MAX_JOINT_POINTS
+    return {
+        'interior': np.stack(
+            [blocks.gg[columns, columns] for columns in network.layout.interiors]
+        ),
+        'exterior': blocks.ee,
+        'points': blocks.pp,
+        'all_global': blocks.gg,
+        'exterior_global': blocks.eg,
+        'joint_points': joint_covariance(blocks).points if few_points else None,
+    }
 
 
 @dataclass(frozen=True)
@@ -455,17 +464,7 @@ def precision_with_fixed_interiors(
     """
     free, equations = equations_with_fixed_interiors(network, adjustment, correction, covariances)
     blocks = covariance_blocks(factorize(free, equations))
-    return replace(
-        precise,
-        interior=np.stack([blocks.gg[columns, columns] for columns in free.layout.interiors]),
-        exterior=blocks.ee,
-        points=blocks.pp,
-        all_global=blocks.gg,
-        exterior_global=blocks.eg,
-        joint_points=(
-            joint_covariance(blocks).points if network.n_points <= MAX_JOINT_POINTS else None
-        ),
-    )
+    return replace(precise, **_covariances(free, blocks))
 
 
 def equations_with_fixed_interiors(

@@ -24,6 +24,7 @@ from scipy.special import chdtri
 
 from ..correction.base import Correction
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration, at_common_angle
+from ..correction.series import sd_grid_pixels
 from ..errors import DataError
 from ..estimation.estimator import interior_about, orientation_fields
 from ..estimation.model_choice import MIN_PIXELS
@@ -35,8 +36,6 @@ from ..rows import chosen_rows
 # The comparison is the cross-validation of mrcal (D. Kogan, mrcal documentation, "A tour of mrcal:
 # cross-validation"): two calibrations that share no exposure make the same predictions, except for
 # what the orientation absorbs and for their noise.
-
-GRID = 24  # cells along the longer side of the image in whose centres predictions are compared
 
 
 @dataclass(frozen=True)
@@ -72,15 +71,17 @@ def difference(
     at the mean principal distance, after removing the best combination of `orientation_fields`.
     Returns None if the area is too small.
     """
-    uv, corrections = _common(one, other, GRID)
+    uv, corrections = _common(one, other, sd_grid_pixels(one.image_size))
     return _difference(uv, (one.interior, other.interior), corrections) if len(uv) else None
 
 
 def _common(
-    one: FluoroscopeCalibration, other: FluoroscopeCalibration, cells: int
+    one: FluoroscopeCalibration, other: FluoroscopeCalibration, uv: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], list[Correction]]:
-    """Return pixels (n, 2) that both calibrations cover, and both corrections; none if too few."""
-    _, uv = cell_centres(one.image_size, cells)
+    """Return the pixels (k, 2) of uv (n, 2) that both cover, and both corrections.
+
+    No pixels if they are too few.
+    """
     corrections = at_common_angle(uv, one, other)
     inside = ~(corrections[0].outside | corrections[1].outside)
     if inside.sum() < MIN_PIXELS:
@@ -189,7 +190,7 @@ def compare_calibrations(
     if first.image_size != second.image_size:
         sizes = [f'{w} x {h} px' for w, h in (first.image_size, second.image_size)]
         raise DataError(f'fluoroscope {name}: the images are {sizes[0]} and {sizes[1]}')
-    uv, corrections = _common(first, second, CELLS)
+    uv, corrections = _common(first, second, cell_centres(first.image_size, CELLS)[1])
     if not len(uv):
         raise DataError(f'fluoroscope {name}: the calibrated areas hardly overlap')
     compared = _difference(uv, (first.interior, second.interior), corrections)

@@ -30,9 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
-from scipy.special import bdtrc, log_ndtr
+from scipy.special import bdtrc, log_ndtr, ndtri
 
-from ..correction.calibration_record import SD_GRID
 from ..correction.fluoroscope_calibration import MAX_FACTOR, NoiseProfile, square_distance
 from ..correction.series import Series, sd_grid_pixels
 from ..exposures.collector import MIN_EXPOSURES
@@ -41,24 +40,10 @@ from ..photogrammetry.outliers import CONTRADICTION, FALSE_ALARM
 
 NEIGHBOURS = 5  # nearest neighbours of an image point; those of its own exposure are ignored
 POINTS = 60  # image points about a node of the grid
-# Standard errors above which the mean product about a node is significant; for the mean product of
-# all image points the limit is CERTAIN.
-SIGNIFICANT_LOCAL = 4.5
 MAX_GROWTH = 4.0  # largest ratio of a mean product, extrapolated to distance zero, to its value
 PLACE = 0.1  # image points with more than this part of the largest variance are in a place
 MIN_CORRELATION = 0.05  # least correlation at which products show what a series omits
 FAR = 30.0  # standard deviations below zero beyond which the posterior is taken as exponential
-# Rejected image points agree if their residuals differ by less than AGREE_SD standard deviations
-# of an inlier, and their distance is less than AGREE_REACH times the typical distance between
-# inliers (the square of AGREE_REACH where only one exposure has image points). Each must agree
-# with AGREE_WITH others.
-AGREE_SD = 5.0
-AGREE_REACH = 3.0
-AGREE_WITH = 2
-# Where only one exposure has image points, residuals also agree if their difference is below this
-# part of the larger one.
-ALONE_AGREE = 0.6
-AGREE_SIGNIFICANT = 1.5  # standard errors by which agreeing pairs must outnumber opposite pairs
 LARGEST_SD = 40.0  # larger residuals [standard deviations] are no errors of a correction
 # Rejected image points are tested together in areas, which are cells that overlap by half. An area
 # needs image points of MIN_TARGETS targets that agree in MIN_EXPOSURES exposures.
@@ -226,85 +211,13 @@ def sd_with_lack_of_fit(
     # Each product occurs twice among the points about a node.
     error = products.value[neighbours].std(axis=1) * np.sqrt(2 / POINTS)
     is_significant = products.is_significant()
-    shows_lack = (mean > SIGNIFICANT_LOCAL * error) | is_significant
+    limit = -ndtri(FALSE_ALARM / len(pixels))  # Bonferroni over the nodes
+    shows_lack = (mean > limit * error) | is_significant
     if is_significant:
         mean = mean * products.growth
     observed = mean / products.shown[neighbours].mean(axis=1) + variance.ravel()
     lack_of_fit = np.where(shows_lack, np.maximum(observed, left_out_variance), left_out_variance)
     return np.sqrt(variance + lack_of_fit.reshape(variance.shape))
-
-
-def sd_of_rejected(
-    inliers: FittedPoints, rejected: FittedPoints, series: Series
-) -> NDArray[np.float64]:
-    """Return standard deviations (33, 33) [px] on a series grid by rejected points that agree.
-
-    They are the largest RMS residual of such points nearby, and zero where there are none, or
-    where chance explains that they agree. Inliers nearby count as image points without that error.
-    Points of one exposure count where no other exposure has inliers: at a border that only one
-    exposure shows, nothing contradicts them.
-    """
-    out = np.zeros(series.sd.size)
-    noise = float(np.sqrt(np.mean(inliers.residuals**2)))
-    distance, _ = cKDTree(inliers.uv).query(inliers.uv, k=[2])
-    reach = AGREE_REACH * float(np.median(distance))
-    size = np.linalg.norm(rejected.residuals, axis=1)
-    candidates = np.flatnonzero(size < LARGEST_SD * noise)
-    if len(candidates) <= AGREE_WITH:
-        return out.reshape(series.sd.shape)
-    points = FittedPoints(
-        rejected.uv[candidates], rejected.residuals[candidates], rejected.exposure[candidates]
-    )
-    uv = points.uv
-    i, j, agree, opposite = _pairs_of_rejected(inliers, points, reach, AGREE_SD * noise)
-    pairs = np.count_nonzero(agree), np.count_nonzero(opposite)
-    if pairs[0] - pairs[1] <= AGREE_SIGNIFICANT * np.sqrt(sum(pairs)):
-        return out.reshape(series.sd.shape)
-    number = np.bincount(np.concatenate([i[agree], j[agree]]), minlength=len(candidates))
-    agreeing = np.flatnonzero(number >= AGREE_WITH)
-    inliers_nearby = cKDTree(inliers.uv).query_ball_point(uv, reach, return_length=True)
-    share = (number + 1) / (number + 1 + inliers_nearby)
-    pixels = sd_grid_pixels(series.functions.image_size)
-    # Each of them affects the nodes about it.
-    cell = np.linalg.norm(np.asarray(series.functions.image_size) / (SD_GRID - 1))
-    for row in agreeing:
-        nodes = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
-        out[nodes] = np.maximum(out[nodes], size[candidates[row]] * np.sqrt(share[row] / 2))
-    return out.reshape(series.sd.shape)
-
-
-def _pairs_of_rejected(
-    inliers: FittedPoints, rejected: FittedPoints, reach: float, limit: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return pairs (k,), (k,) of neighbouring rejected points; which agree, which are opposite.
-
-    reach [px]: largest distance of neighbours of different exposures; limit [px]: largest
-    difference of residuals that agree. Chance makes as many pairs opposite as it makes agree.
-    """
-    neighbours = cKDTree(inliers.uv).query_ball_point(rejected.uv, reach)
-    exposure = rejected.exposure
-    isolated = np.flatnonzero(
-        [np.all(inliers.exposure[rows] == number) for rows, number in zip(neighbours, exposure)]
-    )
-    across_exposures = cKDTree(rejected.uv).query_pairs(reach, output_type='ndarray')
-    across_exposures = across_exposures[
-        exposure[across_exposures[:, 0]] != exposure[across_exposures[:, 1]]
-    ]
-    within_exposure = isolated[
-        cKDTree(rejected.uv[isolated]).query_pairs(AGREE_REACH * reach, output_type='ndarray')
-    ]
-    within_exposure = within_exposure[
-        exposure[within_exposure[:, 0]] == exposure[within_exposure[:, 1]]
-    ]
-    i, j = np.concatenate([across_exposures, within_exposure]).T
-    r = rejected.residuals
-    limits = np.full(len(i), limit)
-    # Beyond the last inliers, the error of a correction grows fast.
-    larger_residual = np.linalg.norm(r[within_exposure], axis=2).max(axis=1, initial=0.0)
-    limits[len(across_exposures) :] = np.maximum(limit, ALONE_AGREE * larger_residual)
-    agree = np.linalg.norm(r[i] - r[j], axis=1) < limits
-    opposite = np.linalg.norm(r[i] + r[j], axis=1) < limits
-    return i, j, agree, opposite
 
 
 def areas_of_rejected(

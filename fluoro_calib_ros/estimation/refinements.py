@@ -22,7 +22,7 @@ from .estimator import coefficients_of
 from .exposure_terms import ExposureTerms, can_be_fitted, exposure_functions, variation
 from .fluoroscope_terms import FluoroscopeTerms, SeriesEquations
 from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
-from .priors import Prior, most_likely_prior, prior_precision, with_more_places, with_shown_places
+from .priors import Prior, prior_precision, with_more_places, with_shown_places
 from .ripples import Ripples, shown_ripples
 
 START_MODES = 16  # initial number of half waves along the image
@@ -294,9 +294,9 @@ def _followed(
     """Return prior and coefficients that follow values (n, 2) [px] of the used points (n,).
 
     The robust adjustment continues from there: at a solution that rejects image points they have
-    no weight, however many they are. A dent is a place with a larger variance of the signal; if no
-    place is shown, the signal gets a short field. Orientations are assumed to be known, which is
-    accurate enough for initial values. scale: scale of the noise.
+    no weight, however many they are. A dent is a place with a larger variance of the signal.
+    Orientations are assumed to be known, which is accurate enough for initial values. scale: scale
+    of the noise.
     """
     functions = part.functions_with(modes, part.prior)
     at_points = functions(part.uv)
@@ -306,10 +306,6 @@ def _followed(
     prior = with_shown_places(functions, weighted[used], observed[used], part.prior)
     information = block_diag(*[weighted.T @ weighted] * 2)
     right = (weighted.T @ observed).T.ravel()
-    if prior.local is None:
-        signal = part.prior.signal.with_short_field(max(part.image_size))
-        prior = replace(part.prior, signal=signal)
-        prior = most_likely_prior(functions, information, right, gauge, prior=prior)
     precision = information + gauge + prior_precision(functions, prior)
     return prior, np.linalg.solve(precision, right)
 

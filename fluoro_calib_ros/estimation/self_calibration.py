@@ -68,7 +68,7 @@ from .initial_network import (
     undetermined,
     with_additional,
 )
-from .lack_of_fit import FittedPoints, sd_of_rejected, sd_with_lack_of_fit
+from .lack_of_fit import FittedPoints, sd_with_lack_of_fit
 from .model_choice import START_MODEL, better_model, with_errors_by
 from .neighbour_regression import NeighbourRegression
 from .options import AUTO, CalibrationOptions, user_estimator
@@ -413,23 +413,17 @@ def _models(
     values = after.residuals + network.additional_correction(after.parameters)
     models = {}
 
-    def points(rows: NDArray[np.int64]) -> FittedPoints:
-        return FittedPoints(
+    for f, name in enumerate(measured.fluoroscopes):
+        rows = network.rows(f)
+        rows = rows[after.inliers[rows]]
+        series = terms.fitted_series(f, after, precise)
+        inliers = FittedPoints(
             network.uv[rows],
             after.residuals[rows],
             network.exposure[rows],
             precise.redundancy[rows].mean(axis=1),
         )
-
-    for f, name in enumerate(measured.fluoroscopes):
-        rows = network.rows(f)
-        rejected = points(rows[~after.inliers[rows]])
-        rows = rows[after.inliers[rows]]
-        series = terms.fitted_series(f, after, precise)
-        sd = np.hypot(
-            sd_with_lack_of_fit(points(rows), series, terms.left_out(f)),
-            sd_of_rejected(points(rows), rejected, series),
-        )
+        sd = sd_with_lack_of_fit(inliers, series, terms.left_out(f))
         models[name] = model_type(0, network.uv[rows], values[rows], series=replace(series, sd=sd))
     return models
 

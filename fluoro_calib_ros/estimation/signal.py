@@ -46,9 +46,6 @@ FINE_PX = 0.5
 START_REACH = 0.15
 START_FINE_REACH = 0.06
 START_FINE_SHARE = 0.1  # initial standard deviation of the short field, relative to the long field
-# Initial standard deviation and relative correlation length of a short field shown by residuals.
-SHOWN_PX = 0.2
-SHOWN_REACH = 0.03
 MAX_STEP = 0.8  # largest step of the logarithm of a standard deviation or length
 STEPS = 4  # steps of Fisher scoring, and of the variances of ripples, in one update
 MIN_DETERMINED = 1e-3  # least number of determined coefficients in a sum
@@ -128,10 +125,6 @@ class Signal:
         Ripples shorter than the distance of image points hardly show in products of neighbours.
         """
         return correlation_of(self.density, frequency, distance)
-
-    def with_short_field(self, side: float) -> Signal:
-        """Return a signal with an initial short field; side: of the image [px]."""
-        return replace(self, fine_sd=SHOWN_PX, fine_reach=SHOWN_REACH * side)
 
     def without_short_field(self, side: float) -> Signal:
         """Return a signal with a very small new short field; side: of the image [px]."""

@@ -19,7 +19,6 @@ from fluoro_calib_ros.checks.beads import _layers, _sums, rejected_beads
 from fluoro_calib_ros.checks.check import Check, more_exposures, verdict_of
 from fluoro_calib_ros.checks.comparison import (
     CELLS,
-    GRID,
     Comparison,
     FieldDifference,
     _difference,
@@ -582,7 +581,7 @@ def test_orientations_absorb_shift_scale_rotation_and_tilt():
 
 
 def test_difference_of_predictions_is_without_gauge_and_signed():
-    _, uv = cell_centres(SIZE, GRID)
+    _, uv = cell_centres(SIZE, 24)
     interior = np.array([511.5, 383.5, 2000.0])
     bump = np.exp(-np.sum((uv - [300, 500]) ** 2, axis=1) / 2 / 40**2)[:, None] * [3.0, -1]
     sd = np.full(len(uv), 0.3)

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import truncnorm
 
 from fluoro_calib_ros.correction.calibration_record import SD_GRID
-from fluoro_calib_ros.correction.series import Functions, Series, sd_grid_pixels
+from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.estimation.lack_of_fit import (
     MIN_TARGETS,
     FittedPoints,
@@ -18,7 +18,6 @@ from fluoro_calib_ros.estimation.lack_of_fit import (
     _products,
     _variance_beyond,
     areas_of_rejected,
-    sd_of_rejected,
     sd_with_lack_of_fit,
 )
 
@@ -294,21 +293,3 @@ def test_few_rejected_points_among_many_inliers_are_not_looked_at():
     points = FittedPoints(uv, np.ones((3, 2)), np.arange(3))
     crowd = rng.uniform(0, 60, (2000, 2))
     assert not areas_of_rejected(points, np.arange(3), crowd, SIZE)
-
-
-def test_rejected_points_reach_the_nodes_of_their_cells():
-    """Also where inliers are dense: a node is at most a cell away."""
-    rng = np.random.default_rng(5)
-    size = (3200, 2400)  # cells of 100 px by 75 px
-    series = Series(Functions(size, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
-    uv = rng.uniform(0, 1, (6000, 2)) * size
-    inliers = FittedPoints(uv, rng.normal(0, NOISE, uv.shape), np.arange(6000) % 12)
-    middle = np.array([1599.5, 1199.5 + 121.0])  # 121 px from a node
-    own = middle + rng.uniform(-1, 1, (12, 2))
-    common = FittedPoints(own, np.tile([3.0, -4.0], (12, 1)), np.arange(12))
-    found = sd_of_rejected(inliers, common, series)
-    near = np.linalg.norm(sd_grid_pixels(size) - middle, axis=1).reshape(found.shape)
-    cell = np.hypot(100.0, 75.0)
-    assert (found[near < cell - 3] > 2).all()
-    assert not found[near > cell + 3].any()
-    assert found.max() <= 5.0 / np.sqrt(2)

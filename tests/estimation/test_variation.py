@@ -21,7 +21,6 @@ from fluoro_calib_ros.estimation.lack_of_fit import (
     FittedPoints,
     LeftOut,
     _growth,
-    sd_of_rejected,
     sd_with_lack_of_fit,
 )
 from fluoro_calib_ros.estimation.signal import Signal, spectral_density
@@ -178,50 +177,3 @@ def test_correlation_of_what_a_series_leaves_out():
     expected = [np.sum(density * f * j0(f * d)) / np.sum(density * f) for d in distance]
     np.testing.assert_allclose(found, expected, atol=0.02)
     assert found[0] == pytest.approx(1.0)
-
-
-def test_rejected_points_that_agree_are_an_error_of_the_correction():
-    """Points of a dent are such an error, false matches are not."""
-    uv, exposure, rng = image_points(5, 200)
-    series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
-    inliers = FittedPoints(uv, rng.normal(0, NOISE, uv.shape), exposure)
-    false = rng.permutation(len(uv))[: len(uv) // 5]
-    wrong = rng.normal(0, 20.0, (len(false), 2))
-    nothing = sd_of_rejected(inliers, FittedPoints(uv[false], wrong, exposure[false]), series)
-    assert (nothing > 0).mean() < 0.02
-    # Many residuals of this size agree by chance, so they show no error.
-    small = wrong / np.linalg.norm(wrong, axis=1)[:, None] * 5 * NOISE
-    nothing = sd_of_rejected(inliers, FittedPoints(uv[false], small, exposure[false]), series)
-    assert not nothing.any()
-    dent = np.flatnonzero(np.linalg.norm(uv - [600, 150], axis=1) < 40)
-    residuals = np.array([1.5, -1.0]) + rng.normal(0, NOISE, (len(dent), 2))
-    rejected = FittedPoints(uv[dent], residuals, exposure[dent])
-    rest = np.setdiff1d(np.arange(len(uv)), dent)
-    outside = FittedPoints(uv[rest], inliers.residuals[rest], exposure[rest])
-    found = sd_of_rejected(outside, rejected, series)
-    row = round(150 / SIZE[1] * (SD_GRID - 1))
-    column = round(600 / SIZE[0] * (SD_GRID - 1))
-    assert 1.0 < found[row, column] < 2.0
-    assert (found > 0).mean() < 0.05
-    # With as many inliers next to them, they make up half of the variance there.
-    half = sd_of_rejected(inliers, rejected, series)
-    assert half[row, column] == pytest.approx(found[row, column] / np.sqrt(2), rel=0.1)
-
-
-def test_rejected_points_at_a_rim_that_one_exposure_shows_are_an_error_of_the_correction():
-    """No other exposure contradicts them there, unless it has inliers at the rim."""
-    uv, exposure, rng = image_points(5, 200)
-    series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
-    residuals = rng.normal(0, NOISE, uv.shape)
-    at_rim = uv[:, 0] > 0.92 * SIZE[0]
-    shown = (exposure == 2) & at_rim
-    growing = (uv[:, 0] - 0.92 * SIZE[0])[shown, None] * [0.05, 0.02] + [1.0, 0.5]
-    rejected = FittedPoints(uv[shown], growing, exposure[shown])
-
-    def found(others):
-        used = np.flatnonzero(others)
-        inliers = FittedPoints(uv[used], residuals[used], exposure[used])
-        return sd_of_rejected(inliers, rejected, series)[:, -2:]
-
-    assert np.count_nonzero(found(~at_rim) > 1.0) > 10
-    assert not found(~shown).any()

@@ -35,7 +35,7 @@ from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.diagnosis import MAX_RELATIVE_SD
 from ..photogrammetry.noise import CERTAIN
-from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
+from ..photogrammetry.plane_resection import flatness, plane_of
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
 from ..photogrammetry.rig_orientation import KnownOrientation
 from .check import rms
@@ -256,7 +256,7 @@ def _fit_of_plane(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> Fit | No
     try:
         with np.errstate(all='ignore'):
             xy = plane_of(xyz).coordinates(xyz)
-            squared = squared_residuals(robust_homography(xy, uv), xy, uv)
+            squared = squared_residuals(robust_dlt(xy, uv), xy, uv)
     except (DataError, np.linalg.LinAlgError):
         return None
     return Fit(float(np.sqrt(np.median(squared))), False, None)

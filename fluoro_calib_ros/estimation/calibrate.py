@@ -170,7 +170,7 @@ def calibrate_request(
             ]
         ),
         created=_now(),
-        solved={label: _solved(run) for label, run in runs.items()},
+        solved={label: run.solved for label, run in runs.items()},
     )
 
 
@@ -196,12 +196,6 @@ def calibrate_part(
                     run, f, name=name, digest=digest, seconds=seconds, noise=noise
                 )
     return out
-
-
-def _solved(run: SelfCalibration) -> SolvedNetwork:
-    """Return the network and the adjustment of a self-calibration."""
-    estimated = run.measured.network.additional_correction(run.after.parameters)
-    return SolvedNetwork(run.measured, run.after, run.correction - estimated, stated=run.stated)
 
 
 def _now() -> str:

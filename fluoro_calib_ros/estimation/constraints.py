@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity, first_few
-from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import MIN_RAYS
-from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.precision import covariance_blocks, covariance_of_exteriors
+from ..photogrammetry.precision import covariance_of_exteriors
 from ..photogrammetry.unknowns import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
@@ -259,19 +257,11 @@ def _mean_of_run(
     The exposures are correlated through interior orientation and object points, so the covariances
     between pairs are included.
     """
-    network = run.measured.network
-    after = run.after
-    equations = normal_equations(
-        network,
-        after.parameters,
-        run.correction - network.additional_correction(after.parameters),
-        after.noise,
-        after.noise.information_factor(after.q),
-    )
-    covariance = covariance_of_exteriors(covariance_blocks(factorize(network, equations)))
-    derivatives = derivatives_of_pairs(after.parameters, pairs)
+    parameters = run.after.parameters
+    covariance = covariance_of_exteriors(run.solved.blocks())
+    derivatives = derivatives_of_pairs(parameters, pairs)
     weights = np.linalg.inv(derivatives @ covariance @ derivatives.transpose(0, 2, 1))
-    pose, operator = mean_of_pairs(after.parameters, pairs, derivatives, weights)
+    pose, operator = mean_of_pairs(parameters, pairs, derivatives, weights)
     return pose, operator @ covariance @ operator.T
 
 

@@ -73,7 +73,7 @@ class SolvedNetwork:
 
         Raises numpy.linalg.LinAlgError if the network does not determine them.
         """
-        blocks = self._blocks()
+        blocks = self.blocks()
         network = self.measured.network
         parameters = self.adjustment.parameters
         angles = np.full((network.n_exposures, 3), np.nan)
@@ -100,7 +100,7 @@ class SolvedNetwork:
 
         p and q are rows of targets. Raises numpy.linalg.LinAlgError as `joint_precision`.
         """
-        blocks = self._blocks()
+        blocks = self.blocks()
         factor = np.ones((len(blocks.pp), 3))
         if self.stated is not None:
             stated = np.diagonal(self.stated.points, axis1=1, axis2=2)
@@ -112,8 +112,8 @@ class SolvedNetwork:
 
         return between
 
-    def _blocks(self) -> CovarianceBlocks:
-        """Return the blocks of the covariance matrix of the network."""
+    def blocks(self) -> CovarianceBlocks:
+        """Return the blocks of the covariance matrix of the network; raises LinAlgError."""
         network = self.measured.network
         noise = self.adjustment.noise
         if self.fixed is not None:

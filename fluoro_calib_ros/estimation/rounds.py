@@ -26,6 +26,7 @@ from ..photogrammetry.diagnosis import (
 from ..photogrammetry.outliers import find_outliers
 from ..photogrammetry.precision import Precision
 from ..photogrammetry.unknowns import discrepancies
+from .fixed_calibration import SolvedNetwork
 from .initial_network import Measured
 
 SETTLED_PX = 2e-3  # RMS change of the correction below which a round is the last
@@ -80,6 +81,13 @@ class SelfCalibration:
     def claims(self) -> Precision:
         """Stated precision of the unknowns, including errors of the models."""
         return self.stated or self.precision
+
+    @property
+    def solved(self) -> SolvedNetwork:
+        """The network and its adjustment."""
+        estimated = self.measured.network.additional_correction(self.after.parameters)
+        correction = self.correction - estimated
+        return SolvedNetwork(self.measured, self.after, correction, stated=self.stated)
 
 
 class History:

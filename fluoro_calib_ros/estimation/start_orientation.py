@@ -31,7 +31,6 @@ from ..photogrammetry.plane_resection import (
     plane_of,
     poses_of_homography,
     principal_distance_of_planes,
-    robust_homography,
 )
 from ..photogrammetry.resection import (
     MIN_FLATNESS,
@@ -95,7 +94,7 @@ def view_of(frame: Frame, xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> 
             view = replace(view, projection=robust_dlt(xyz, uv))
         if flat < NEARLY_FLAT:
             plane = plane_of(xyz)
-            image = robust_homography(plane.coordinates(xyz), uv)
+            image = robust_dlt(plane.coordinates(xyz), uv)
             view = replace(view, plane=plane, plane_image=image)
     except DataError as error:
         return replace(view, error=error.finding)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from .resection import MIN_FLATNESS, robust_dlt
+from .resection import MIN_FLATNESS
 
 # Smallest singular value of the conditions on the principal distance, over its largest possible
 # value, below which no plane is tilted enough: some 3 degrees in a beam of 15 degrees.
@@ -56,14 +56,6 @@ def plane_of(xyz: NDArray[np.float64]) -> Plane:
         raise DataError('all targets are collinear or coincide')
     axes = axes * np.array([1, 1, np.linalg.det(axes)])[:, None]
     return Plane(centre, axes)
-
-
-def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the homography (3, 3), uv ~ H (xy, 1), of targets with up to half false matches.
-
-    xy (n, 2) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError as robust_dlt.
-    """
-    return robust_dlt(xy, uv)
 
 
 def principal_distance_of_planes(

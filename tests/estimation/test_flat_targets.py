@@ -36,8 +36,8 @@ from fluoro_calib_ros.photogrammetry.plane_resection import (
     plane_of,
     poses_of_homography,
     principal_distance_of_planes,
-    robust_homography,
 )
+from fluoro_calib_ros.photogrammetry.resection import robust_dlt
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures
 
@@ -78,7 +78,7 @@ def test_homographies_give_pose_and_principal_distance():
         uv = ideal(pose, interior)
         wrong = rng.permutation(len(uv))[: int(0.4 * len(uv))]
         uv[wrong] += rng.uniform(-300, 300, (len(wrong), 2))
-        found.append(robust_homography(plane.coordinates(POINTS), uv))
+        found.append(robust_dlt(plane.coordinates(POINTS), uv))
         rotation, source = fluoroscope().exterior(pose)
         candidates = poses_of_homography(found[-1], plane, interior)
         assert rotation_angle(candidates[0][0] @ rotation.T) < 1e-6
@@ -87,7 +87,7 @@ def test_homographies_give_pose_and_principal_distance():
         assert rotation_angle(back[0] @ rotation.T) < 1e-6
         assert rotation_angle(candidates[1][0] @ rotation.T) > np.deg2rad(15)
     assert principal_distance_of_planes(found, interior[:2]) == pytest.approx(3900, rel=1e-6)
-    flat = [robust_homography(plane.coordinates(POINTS), ideal(p, interior)) for p in poses([0])]
+    flat = [robust_dlt(plane.coordinates(POINTS), ideal(p, interior)) for p in poses([0])]
     assert principal_distance_of_planes(flat, interior[:2]) is None
 
 
@@ -147,7 +147,7 @@ def test_a_grid_parallel_to_the_image_needs_the_principal_distance():
     error = calibration.model.predict(inside) - fluoroscope().distortion(inside)
     # A homography absorbs what the exposures cannot show: shift, scale, rotation and tilt.
     corrected = inside + error
-    h = robust_homography(inside, corrected)
+    h = robust_dlt(inside, corrected)
     mapped = np.column_stack([inside, np.ones(len(inside))]) @ h.T
     left = mapped[:, :2] / mapped[:, 2:] - corrected
     assert np.sqrt(np.mean(left**2)) < 0.25

@@ -23,7 +23,6 @@ from fluoro_calib_ros.estimation.alternation import Regressions, _information
 from fluoro_calib_ros.estimation.calibrate import (
     _calibrated_group,
     _image_noise,
-    _solved,
     adjust_with_calibrations,
     calibrate_part,
     calibrate_request,
@@ -285,7 +284,7 @@ def test_correction_of_rounds_is_that_of_their_model_and_estimated_terms(model):
     )
     estimated = network.additional_correction(run.after.parameters)
     assert estimated.any() == (model == 'hybrid')
-    np.testing.assert_allclose(_solved(run).correction, run.correction - estimated)
+    np.testing.assert_allclose(run.solved.correction, run.correction - estimated)
     core = run.trained
     change = [one.change for one in run.history]
     assert len(run.history) == 2 and change[1] < change[0] and not run.converged
@@ -563,7 +562,7 @@ def test_figures_of_a_calibration_are_those_of_its_adjustment():
     np.testing.assert_array_equal(starts.interior['a'], figures.interior)
     assert result.used_exposures == {'a': {1, 2, 3, 4, 5, 6}}
     assert (result.targets.covariance == run.claims.points).all()
-    assert not _solved(run).correction.any()
+    assert not run.solved.correction.any()
 
 
 def test_a_part_of_a_calibration_has_the_noise_of_the_whole():

@@ -24,7 +24,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from ..limits import MAX_CORNERS
 from .calibration_record import SD_GRID
-from .series import SERIES_FIELDS, Series, packed
+from .series import BULK_CHUNK, SERIES_FIELDS, Series, packed
 
 
 class CorrectionStatus(IntEnum):
@@ -39,7 +39,6 @@ class CorrectionStatus(IntEnum):
 # points scattered at random (Poisson) a disc is empty with probability exp(-9 pi); where they are
 # nine times less dense, with probability exp(-pi).
 HOLE_SPACINGS = 3.0
-BULK_CHUNK = 2048  # pixels evaluated per chunk by `evaluate_in_bulk`: some milliseconds
 
 
 class Smoothness(Enum):

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from .base import BULK_CHUNK, CorrectionModel, Smoothness
+from .base import CorrectionModel, Smoothness
+from .series import BULK_CHUNK
 
 # Errors of bilinear interpolation between the corners of the cells of a lookup grid.
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from .base import BULK_CHUNK, Correction, CorrectionModel, Smoothness
+from .base import Correction, CorrectionModel, Smoothness
+from .series import BULK_CHUNK
 from .terms import polynomial_powers
 
 # Nearest training points of very many pixels, block by block.
@@ -25,7 +26,6 @@ from .terms import polynomial_powers
 
 BLOCK = 200  # pixels per block
 MIN_BLOCK = 9  # minimum number of pixels per block, where training points are dense
-MAX_BLOCK_PX = 64.0  # longest side of a block, for pixels that are far apart
 BLOCKS_PER_QUERY = 32  # blocks per call of scipy
 MAX_AT_ONCE = 2_000_000  # maximum number of candidates per query, and of weights, to bound memory
 # Work in candidates of a pixel: per block, and per neighbour in the search from its centre.
@@ -94,11 +94,7 @@ def _blocks(uv: NDArray[np.float64], reach: float) -> list[NDArray[np.int64]]:
     low = uv.min(axis=0)
     high = uv.max(axis=0)
     spacing = np.sqrt(np.prod(high - low + 1) / len(uv))
-    side = min(
-        np.sqrt(BLOCK) * spacing,
-        max(MAX_BLOCK_PX, reach / 2),
-        max(reach, np.sqrt(MIN_BLOCK) * spacing),
-    )
+    side = min(np.sqrt(BLOCK) * spacing, max(reach, np.sqrt(MIN_BLOCK) * spacing))
     column, row = ((uv - low) / side).astype(np.intp).T
     block = row * (column.max() + 1) + column
     order = np.argsort(block, kind='stable')

@@ -26,7 +26,7 @@ from .terms import CUBIC, polynomial_powers, ring_coefficients
 
 MARGIN = 1.3  # size of the rectangle at whose border the sines vanish, relative to the image
 RING_DEGREE = CUBIC + 2  # degree of the first radial polynomial beyond a cubic trend
-PREDICTION_CHUNK = 20_000  # pixels per evaluation of a series
+BULK_CHUNK = 2048  # pixels evaluated at once: some milliseconds
 
 
 @dataclass(frozen=True)
@@ -278,8 +278,8 @@ class Series:
 
     def predict_in_chunks(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return corrections (n, 2) [px] at many pixels uv (n, 2), with bounded memory."""
-        starts = range(0, max(1, len(uv)), PREDICTION_CHUNK)
-        return np.concatenate([self.predict(uv[i : i + PREDICTION_CHUNK]) for i in starts])
+        starts = range(0, max(1, len(uv)), BULK_CHUNK)
+        return np.concatenate([self.predict(uv[i : i + BULK_CHUNK]) for i in starts])
 
     def sd_at(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Return interpolated standard deviations (n,) [px] of the corrections at uv (n, 2)."""

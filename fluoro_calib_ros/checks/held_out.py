@@ -31,7 +31,6 @@ from .residual_tests import RejectedExposure, noise_of, residuals_of
 # are interchanged, or the image points are already corrected.
 
 MAX_NOISE = 2.0  # maximum RMSE of image points over their noise
-CORRECTED = 0.6  # RMSE without over RMSE with correction, of points that are already corrected
 
 
 def misfits(
@@ -101,21 +100,15 @@ def poor_fits(
     """Return a finding for every fluoroscope whose calibration does not fit its exposures."""
     out = []
     for name, ratio in misfits(result, calibrations, frames).items():
-        after = rms(result.fluoroscopes[name].rmse_after)
-        before = rms(result.fluoroscopes[name].rmse_before)
-        kind = Kind.POOR_CALIBRATION_FIT
-        reason = 'the image has changed, or the calibration is of another fluoroscope'
-        if before < CORRECTED * after:
-            kind = Kind.CORRECTED_ALREADY
-            reason = 'the image points seem to be already corrected'
+        rmse = rms(result.fluoroscopes[name].rmse_after)
         out.append(
             Finding(
-                kind,
-                f'RMSE {after:.2f} px with the calibration fixed, {ratio:.1f} times the noise '
-                'with which it was determined',
+                Kind.POOR_CALIBRATION_FIT,
+                f'RMSE {rmse:.2f} px with the calibration fixed, {ratio:.1f} times the noise with '
+                'which it was determined',
                 Place((name,)),
-                reason,
-                numbers={'rmse_px': after, 'ratio': ratio},
+                'the image has changed, or the calibration is of another fluoroscope',
+                numbers={'rmse_px': rmse, 'ratio': ratio},
             )
         )
     return out

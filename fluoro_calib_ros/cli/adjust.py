@@ -18,7 +18,6 @@ from .arguments import (
 )
 from .output import print_findings, print_result, styled_verdict
 
-CONTRADICTIONS = (Kind.CORRECTED_ALREADY, Kind.POOR_CALIBRATION_FIT)
 HOLDS = 'The calibration holds for these exposures; its interior orientation was fixed.'
 DOES_NOT_HOLD = (
     'The calibration does not hold for these exposures; its interior orientation was fixed. '
@@ -63,7 +62,7 @@ def run(arguments: argparse.Namespace) -> bool:
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)
     save_result(arguments.out, result, covariance=arguments.covariance)
     print_findings(result.findings, 'doubtful: ')
-    holds = not any(finding.kind in CONTRADICTIONS for finding in result.findings)
+    holds = not any(f.kind is Kind.POOR_CALIBRATION_FIT for f in result.findings)
     text = HOLDS if holds else DOES_NOT_HOLD
     verdict = styled_verdict(text, 'pass' if holds else 'fail')
     document = {**written_document(result), 'holds': holds}

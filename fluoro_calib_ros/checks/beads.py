@@ -36,7 +36,7 @@ from .bead_intersection import (
     rays_of,
 )
 from .calibration_evidence import Evidence, Subject
-from .check import Check
+from .check import Check, not_made
 from .exchanged_beads import exchanged_beads, rate_of
 
 MIN_LAYER = 8  # minimum number of beads in a layer, and outside of it
@@ -371,7 +371,9 @@ def compare_with_survey(
     """
     count = len(beads.target_id)
     if count < MIN_BEADS:
-        return [_not_made(kind, count) for kind in (Kind.BEADS, Kind.DISTANCES)]
+        reason = f'only {count} beads are seen often enough to be located from the images alone'
+        kinds = (Kind.BEADS, Kind.DISTANCES)
+        return [not_made(kind, reason, numbers={'beads': count}) for kind in kinds]
     limit = SD_FACTOR**2 * chdtri(3, FALSE_ALARM / count)
     square = beads.chi2
     suspects = np.flatnonzero(square > limit)
@@ -418,17 +420,6 @@ def compare_with_survey(
     ]
 
 
-def _not_made(kind: Kind, count: int) -> Check:
-    """Return a check that could not be made because too few beads are seen."""
-    return Check(
-        kind,
-        f'check {kind.value} could not be performed, only {count} beads are seen often enough to '
-        'be located from the images alone',
-        advice='take more exposures',
-        numbers={'beads': count},
-    )
-
-
 def _wrong_beads(target_id: NDArray[np.int64], size: NDArray[np.float64]) -> str:
     """Return the names of the beads with a wrong survey, and their errors [mm], as text."""
     description = first_few(
@@ -439,10 +430,7 @@ def _wrong_beads(target_id: NDArray[np.int64], size: NDArray[np.float64]) -> str
 
 def _check_distances(beads: Beads, has_trend: bool) -> Check:
     if len(beads.target_id) < MIN_BEADS:
-        return Check(
-            Kind.DISTANCES,
-            'check distances could not be performed, too few beads agree with their survey',
-        )
+        return not_made(Kind.DISTANCES, 'too few beads agree with their survey', advice='')
     measured = distances(beads)
     by_chance = float(np.sqrt(chdtri(measured.freedom, FALSE_ALARM) / measured.freedom))
     return Check(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -118,15 +119,18 @@ def verdict_of(checks: Iterable[Check]) -> str:
     return 'cannot tell' if None in passed or not passed else 'pass'
 
 
+def not_made(kind: Kind, reason: str, advice: str = 'take more exposures', **more: Any) -> Check:
+    """Return a check that could not be made, with a reason; more: further fields of a finding."""
+    return Check(
+        kind, f'check {kind.value} could not be performed, {reason}', advice=advice, **more
+    )
+
+
 def too_little_data(kind: Kind, fluoroscope: str, reason: str, count: int) -> Check:
     """Return a check that could not be made, for a reason in `count` exposures."""
-    return Check(
-        kind,
-        f'check {kind.value} could not be performed, {reason}',
-        Place((fluoroscope,)),
-        more_exposures(count),
-        numbers={'exposures': count},
-    )
+    place = Place((fluoroscope,))
+    numbers = {'exposures': count}
+    return not_made(kind, reason, more_exposures(count), place=place, numbers=numbers)
 
 
 def more_exposures(count: int) -> str:

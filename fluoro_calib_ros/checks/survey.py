@@ -18,7 +18,7 @@ from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.network import DATUM_DEFECT, MIN_RAYS, similarity_directions
 from ..photogrammetry.outliers import CONTRADICTION
 from .beads import MIN_BEADS
-from .check import Check
+from .check import Check, not_made
 
 # Errors along two rays are cot(angle / 2) times those across: 6 times at 20 degrees. A single sd
 # for all axes would then be wrong by more than half for the worst axis.
@@ -109,9 +109,8 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
     """
     common_ids = np.intersect1d(one.target_id, other.target_id)
     if len(common_ids) < MIN_BEADS:
-        return halves_not_compared(
-            f'two halves of the exposures have only {len(common_ids)} beads in common'
-        )
+        reason = f'two halves of the exposures have only {len(common_ids)} beads in common'
+        return not_made(Kind.HALVES, reason)
     one, other = (
         beads.without(np.setdiff1d(beads.target_id, common_ids)) for beads in (one, other)
     )
@@ -136,15 +135,6 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
         value=square / freedom,
         limit=max(HALVES_LIMIT, float(chdtri(freedom, CONTRADICTION)) / freedom),
         unit='predicted variance',
-    )
-
-
-def halves_not_compared(reason: str) -> Check:
-    """Return the check 'halves' that could not be made, with a reason."""
-    return Check(
-        Kind.HALVES,
-        f'check halves could not be performed, {reason}',
-        advice='take more exposures',
     )
 
 

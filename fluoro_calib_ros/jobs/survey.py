@@ -16,14 +16,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..brief import brief_repr
-from ..checks.check import Check, Validation, verdict_of
-from ..checks.survey import (
-    check_survey,
-    check_survey_halves,
-    displaced,
-    halves_not_compared,
-    unsurveyed,
-)
+from ..checks.check import Check, Validation, not_made, verdict_of
+from ..checks.survey import check_survey, check_survey_halves, displaced, unsurveyed
 from ..errors import DataError
 from ..estimation.calibrate import calibrate_request
 from ..estimation.options import CalibrationOptions, CalibrationRequest
@@ -211,9 +205,8 @@ def _halves(
     )
     fewest = min(len(fluoroscope.exposures) for fluoroscope in result.fluoroscopes.values())
     if fewest < 2 * MIN_EXPOSURES:
-        return halves_not_compared(
-            f'{too_few(fewest, "exposure")} for two halves of {MIN_EXPOSURES} or more'
-        )
+        reason = f'{too_few(fewest, "exposure")} for two halves of {MIN_EXPOSURES} or more'
+        return not_made(Kind.HALVES, reason)
     # Start from the better coordinates found so far. The scale is not compared, so exclude its
     # uncertainty.
     start = replace(
@@ -228,7 +221,7 @@ def _halves(
         try:
             half_result = calibrate_request(request.calibration_of(frames, start), None)
         except (DataError, np.linalg.LinAlgError) as error:
-            return halves_not_compared(f'half of the exposures cannot be adjusted ({error})')
+            return not_made(Kind.HALVES, f'half of the exposures cannot be adjusted ({error})')
         beads = surveyed_beads(half_result, start)
         unsurveyed_ids = {
             target for finding in unsurveyed(beads) for target in finding.place.target_id

@@ -37,9 +37,9 @@ from ..correction.series import Functions, Series
 from ..photogrammetry.precision import solved_additional
 from .estimator import AdjustedTerms, AdjustmentProblem, coefficients_of
 from .exposure_terms import ExposureTerms, estimates_beside_free_points
-from .fluoroscope_terms import FluoroscopeTerms, SeriesEquations
+from .fluoroscope_terms import FluoroscopeTerms
 from .lack_of_fit import LeftOut
-from .priors import Prior, most_likely_prior
+from .priors import Prior, SeriesEquations, most_likely_prior
 from .refinements import (
     SETTLED_PRIOR,
     START_MODES,
@@ -258,9 +258,7 @@ def _renew_prior(
 ) -> bool:
     """Update the prior of a fluoroscope; return whether it hardly changes."""
     last = part.prior
-    prior = most_likely_prior(
-        part.functions, equations.information, equations.right, part.gauge, prior=last
-    )
-    prior = more_places.propose(part, equations, prior) or prior
+    prior = most_likely_prior(equations, last)
+    prior = more_places.propose(equations, prior) or prior
     part.use_prior(prior)
     return not part.functions.modes or prior.change(last, part.functions) < SETTLED_PRIOR

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,7 @@ from .lack_of_fit import FittedPoints, LeftOut, LeftOutInPlaces
 from .local_signal import correlation_beyond
 from .priors import (
     Prior,
+    SeriesEquations,
     covariance_by_signal,
     covariance_of_series,
     gauge_precision,
@@ -49,14 +50,6 @@ if TYPE_CHECKING:
 RINGS = 2  # radial polynomials of degree 5 and 7, which a curved screen adds at the border
 # Least initial standard deviation [px]: residuals of a detector without distortion are only noise.
 MIN_START_SD_PX = 0.1
-
-
-@dataclass(frozen=True)
-class SeriesEquations:
-    """Normal equations of the coefficients of a series, all other unknowns eliminated."""
-
-    information: NDArray[np.float64]  #: (2m, 2m), without a prior
-    right: NDArray[np.float64]  #: (2m,)
 
 
 class FluoroscopeTerms:
@@ -125,7 +118,9 @@ class FluoroscopeTerms:
         ripples = ripples_of(self.functions, matrix)
         start = replace(start, signal=replace(start.signal, ripples=ripples))
         right = information @ matrix.ravel()
-        return most_likely_prior(self.functions, information, right, self.gauge, prior=start)
+        return most_likely_prior(
+            SeriesEquations(self.functions, information, right, self.gauge), start
+        )
 
     def weighted(self, values: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
         """Divide values (n, k) at image points by the standard deviation of their noise."""
@@ -225,7 +220,7 @@ class FluoroscopeTerms:
             information, right = without_exposure_terms(
                 information, right, self.own.precision, self.of_series.stop
             )
-        self._last_equations = SeriesEquations(information, right)
+        self._last_equations = SeriesEquations(self.functions, information, right, self.gauge)
         return self._last_equations
 
     def series(self, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]) -> Series:
@@ -256,9 +251,8 @@ class FluoroscopeTerms:
         )
         last = self._last_equations
         if last is not None:
-            covariance = covariance + covariance_by_signal(
-                self.functions, last.information, last.right, self.gauge, self.prior
-            )
+            equations = replace(last, gauge=self.gauge)  # about the last interior orientation
+            covariance = covariance + covariance_by_signal(equations, self.prior)
         return self.series(coefficients, covariance)
 
     def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleFit | None:

@@ -65,6 +65,21 @@ class Prior:
         return max(change, self.local.change(other.local))
 
 
+@dataclass(frozen=True)
+class SeriesEquations:
+    """Normal equations of the coefficients of a series, all other unknowns eliminated."""
+
+    functions: Functions
+    information: NDArray[np.float64]  #: (2m, 2m), without a prior
+    right: NDArray[np.float64]  #: (2m,)
+    gauge: NDArray[np.float64]  #: (2m, 2m) precision matrix of the gauge
+
+    @property
+    def with_gauge(self) -> NDArray[np.float64]:
+        """Information (2m, 2m) that includes the gauge."""
+        return self.information + self.gauge
+
+
 def starting_prior(functions: Functions, sd: float) -> Prior:
     """Return an initial prior; sd: RMS residual without correction [px]."""
     _, count = trend_transformation(functions.degree, functions.rings)
@@ -153,46 +168,35 @@ def covariance_of_series(
     )
 
 
-def covariance_by_signal(
-    functions: Functions,
-    information: NDArray[np.float64],
-    right: NDArray[np.float64],
-    gauge: NDArray[np.float64],
-    prior: Prior,
-) -> NDArray[np.float64]:
+def covariance_by_signal(equations: SeriesEquations, prior: Prior) -> NDArray[np.float64]:
     """Return the covariance (2m, 2m) that a series gains because its signal is only estimated.
 
     It is the mean over plausible signals of the covariance with each and of the squared change of
-    the coefficients, less the covariance with the most likely signal. Arguments as in
-    `most_likely_prior`.
+    the coefficients, less the covariance with the most likely signal.
     """
-    base = information + gauge
-    out = np.zeros_like(base)
+    out = np.zeros_like(equations.information)
+    functions = equations.functions
     if not functions.modes:
         return out
-    equations = _signal_equations(functions, base, right, prior)
-    signals = plausible_signals(prior.signal, equations, max(functions.image_size))
-    mean, covariance = _posterior(functions, base, right, prior)
+    signals = plausible_signals(
+        prior.signal, _signal_equations(equations, prior), max(functions.image_size)
+    )
+    mean, covariance = _posterior(equations, prior)
     for signal in signals:
-        new_mean, new_covariance = _posterior(
-            functions, base, right, replace(prior, signal=signal)
-        )
+        new_mean, new_covariance = _posterior(equations, replace(prior, signal=signal))
         change = new_mean - mean
         out += (new_covariance - covariance + np.outer(change, change)) / len(signals)
     return out
 
 
 def _posterior(
-    functions: Functions,
-    information: NDArray[np.float64],
-    right: NDArray[np.float64],
-    prior: Prior,
+    equations: SeriesEquations, prior: Prior
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return coefficients (2m,) and their covariance (2m, 2m); information includes the gauge."""
-    precision = information + prior_precision(functions, prior)
+    """Return coefficients (2m,) and their covariance (2m, 2m)."""
+    precision = equations.with_gauge + prior_precision(equations.functions, prior)
     factor, _ = cho_factor(precision, lower=True)
     covariance = mirror_lower(lapack.dpotri(factor, lower=1)[0])
-    return covariance @ right, covariance
+    return covariance @ equations.right, covariance
 
 
 def gauge_precision(
@@ -210,49 +214,33 @@ def gauge_precision(
     return rows.T @ rows / GAUGE_SD_PX**2
 
 
-def most_likely_prior(
-    functions: Functions,
-    information: NDArray[np.float64],
-    right: NDArray[np.float64],
-    gauge: NDArray[np.float64],
-    prior: Prior,
-) -> Prior:
+def most_likely_prior(equations: SeriesEquations, prior: Prior) -> Prior:
     """Return a prior with a larger marginal likelihood: signal first, then trend.
 
-    Repeat until the prior does not change.
-
-    information, right: (2m,) normal equations of the coefficients without a prior, all other
-    unknowns eliminated. gauge: (2m, 2m) precision matrix of the gauge. prior: present prior.
+    Repeat until the prior does not change. prior: present prior.
     """
-    if functions.modes:
-        prior = _most_likely_signal(functions, information + gauge, right, prior)
-    return _most_likely_trend(functions, information + gauge, right, prior)
+    if equations.functions.modes:
+        prior = _most_likely_signal(equations, prior)
+    return _most_likely_trend(equations, prior)
 
 
-def _most_likely_signal(
-    functions: Functions,
-    information: NDArray[np.float64],
-    right: NDArray[np.float64],
-    prior: Prior,
-) -> Prior:
+def _most_likely_signal(equations: SeriesEquations, prior: Prior) -> Prior:
     """Return the prior with an updated signal."""
-    equations = _signal_equations(functions, information, right, prior)
-    signal = most_likely_signal(prior.signal, equations, max(functions.image_size))
+    functions = equations.functions
+    of_signal = _signal_equations(equations, prior)
+    signal = most_likely_signal(prior.signal, of_signal, max(functions.image_size))
     local = prior.local
     if local is not None:
-        local = _renewed(local, equations, signal.variance(functions.frequency))
+        local = _renewed(local, of_signal, signal.variance(functions.frequency))
     return replace(prior, signal=signal, local=local)
 
 
-def _signal_equations(
-    functions: Functions,
-    information: NDArray[np.float64],
-    right: NDArray[np.float64],
-    prior: Prior,
-) -> SignalEquations:
-    """Return normal equations with all priors except the signal's; information: with the gauge."""
+def _signal_equations(equations: SeriesEquations, prior: Prior) -> SignalEquations:
+    """Return normal equations with all priors except the signal's."""
+    functions = equations.functions
     trend = trend_columns(functions)
-    base = information.copy(order='F')
+    right = equations.right
+    base = np.asfortranarray(equations.with_gauge)
     base[np.ix_(trend, trend)] += _trend_precision(functions, prior)
     columns = np.setdiff1d(np.arange(len(right)), trend)
     if prior.local is not None:
@@ -331,35 +319,23 @@ def with_shown_places(
     return replace(prior, local=with_likely_places(functions, estimates(prior), prior.local))
 
 
-def with_more_places(
-    functions: Functions,
-    information: NDArray[np.float64],
-    right: NDArray[np.float64],
-    gauge: NDArray[np.float64],
-    prior: Prior,
-) -> Prior:
-    """Return the prior with more places of larger signal variance, if there are any.
-
-    Arguments as in `most_likely_prior`.
-    """
-    coefficients, covariance = _posterior(functions, information + gauge, right, prior)
+def with_more_places(equations: SeriesEquations, prior: Prior) -> Prior:
+    """Return the prior with more places of larger signal variance, if there are any."""
+    functions = equations.functions
+    coefficients, covariance = _posterior(equations, prior)
     mean = coefficients.reshape(2, -1).T[functions.trend :]
     covariances = np.stack([covariance[block, block] for block in _sines(functions)])
     estimates = SineEstimates.of(signal_precision(functions, prior), mean, covariances)
     return replace(prior, local=with_likely_places(functions, estimates, prior.local))
 
 
-def _most_likely_trend(
-    functions: Functions,
-    information: NDArray[np.float64],
-    right: NDArray[np.float64],
-    prior: Prior,
-) -> Prior:
+def _most_likely_trend(equations: SeriesEquations, prior: Prior) -> Prior:
     """Return the prior with updated variances of the trend terms, one after the other."""
+    functions = equations.functions
     to_terms, count = trend_transformation(functions.degree, functions.rings)
     if not count:
         return prior
-    matrix, right = _trend_alone(functions, information, right, prior)
+    matrix, right = _trend_alone(equations, prior)
     from_terms = np.linalg.inv(to_terms)
     matrix = from_terms.T @ matrix @ from_terms
     right = from_terms.T @ right
@@ -383,12 +359,12 @@ def _most_likely_trend(
 
 
 def _trend_alone(
-    functions: Functions,
-    information: NDArray[np.float64],
-    right: NDArray[np.float64],
-    prior: Prior,
+    equations: SeriesEquations, prior: Prior
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Eliminate the signal; return information and right side of the trend coefficients."""
+    functions = equations.functions
+    information = equations.with_gauge
+    right = equations.right
     trend = trend_columns(functions)
     sines = np.setdiff1d(np.arange(len(right)), trend)
     if not len(sines):

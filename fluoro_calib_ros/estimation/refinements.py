@@ -20,9 +20,9 @@ from scipy.linalg import block_diag
 from ..photogrammetry.adjustment import Adjustment
 from .estimator import coefficients_of
 from .exposure_terms import ExposureTerms, can_be_fitted, exposure_functions, variation
-from .fluoroscope_terms import FluoroscopeTerms, SeriesEquations
+from .fluoroscope_terms import FluoroscopeTerms
 from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
-from .priors import Prior, prior_precision, with_more_places, with_shown_places
+from .priors import Prior, SeriesEquations, prior_precision, with_more_places, with_shown_places
 from .ripples import Ripples, shown_ripples
 
 START_MODES = 16  # initial number of half waves along the image
@@ -90,16 +90,12 @@ class MorePlaces:
     def __init__(self, searches: int = MAX_PLACE_SEARCHES) -> None:
         self._left = searches
 
-    def propose(
-        self, part: FluoroscopeTerms, equations: SeriesEquations, renewed: Prior
-    ) -> Prior | None:
-        """Return a prior to replace the updated one, or None; part: still has the last prior."""
+    def propose(self, equations: SeriesEquations, renewed: Prior) -> Prior | None:
+        """Return a prior to replace the updated one, or None."""
         if not self._left or renewed.local is None:
             return None
         self._left -= 1
-        return with_more_places(
-            part.functions, equations.information, equations.right, part.gauge, prior=renewed
-        )
+        return with_more_places(equations, renewed)
 
 
 class NumberOfSines:

@@ -49,6 +49,7 @@ from fluoro_calib_ros.estimation.model_choice import better_model
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.priors import (
     Prior,
+    SeriesEquations,
     gauge_precision,
     has_rings,
     most_likely_prior,
@@ -194,7 +195,7 @@ def test_rings_exist_where_the_distortion_has_them(amplitude):
     prior = starting_prior(functions, 1.0)
     gauge = gauge_precision(values, uv, np.array([511.5, 511.5, 4000.0]))
     for _ in range(4):
-        prior = most_likely_prior(functions, information, right, gauge, prior)
+        prior = most_likely_prior(SeriesEquations(functions, information, right, gauge), prior)
     assert has_rings(functions, prior) == (amplitude > 0)
     # The spiral and the terms that resemble affinity and shear do not exist.
     assert (prior.trend[[15, 16, 17]] < 1e-6).all()
@@ -347,7 +348,7 @@ def test_prior_of_a_signal_is_estimated():
         )
         gauge = gauge_precision(functions(uv), uv, np.array([511.5, 511.5, 4000.0]))
         for _ in range(4):
-            prior = most_likely_prior(functions, information, right, gauge, prior)
+            prior = most_likely_prior(SeriesEquations(functions, information, right, gauge), prior)
         found.append(prior)
     assert np.mean([p.signal.sd for p in found]) == pytest.approx(0.5, rel=0.2)
     assert np.mean([p.signal.reach for p in found]) == pytest.approx(220, rel=0.2)
@@ -409,7 +410,9 @@ def test_prior_of_a_signal_says_what_short_waves_have(smoothness):
     information, right = drawn_field(functions, there, 4, uv, 0.1)
     prior = starting_prior(functions, 1.0)
     for _ in range(5):
-        prior = most_likely_prior(functions, information, right, np.zeros_like(information), prior)
+        prior = most_likely_prior(
+            SeriesEquations(functions, information, right, np.zeros_like(information)), prior
+        )
     for part in (0.7, 1.0):
         at = part * functions.highest
         assert prior.signal.sd_beyond(at) == pytest.approx(there.signal.sd_beyond(at), rel=0.4)
@@ -427,7 +430,7 @@ def test_a_signal_of_two_scales_is_found_from_the_observations():
     prior = starting_prior(functions, 5.0)
     gauge = np.zeros_like(information)
     for _ in range(5):
-        prior = most_likely_prior(functions, information, right, gauge, prior)
+        prior = most_likely_prior(SeriesEquations(functions, information, right, gauge), prior)
     assert prior.signal.fine_sd == pytest.approx(0.4, rel=0.25)
     assert prior.signal.fine_reach == pytest.approx(80, rel=0.3)
     assert prior.signal.sd_beyond(0.0) == pytest.approx(
@@ -529,7 +532,9 @@ def test_prior_of_ripples_is_estimated():
     information, right = drawn_field(functions, Prior(there, np.zeros(0)), 2, uv, 0.25)
     prior = Prior(Signal(0.5, 300.0, 1e-3, 200.0, ripples=ripples(30.0)), np.zeros(0))
     for _ in range(5):
-        prior = most_likely_prior(functions, information, right, np.zeros_like(information), prior)
+        prior = most_likely_prior(
+            SeriesEquations(functions, information, right, np.zeros_like(information)), prior
+        )
     found = prior.signal.variance(width * np.array([20.0, 21.0, 22.0]))
     assert found.mean() == pytest.approx(300.0, rel=0.2)
     assert prior.signal.ripples.bands == (20, 21, 22)

@@ -23,6 +23,7 @@ from fluoro_calib_ros.estimation.local_signal import (
 )
 from fluoro_calib_ros.estimation.priors import (
     Prior,
+    SeriesEquations,
     most_likely_prior,
     prior_precision,
     signal_precision,
@@ -122,9 +123,9 @@ def test_place_is_found_and_its_variance_estimated():
         prior = replace(SMOOTH, local=place((416.0, 608.0), 0.02))
         gauge = np.zeros_like(information)
         for _ in range(5):
-            prior = most_likely_prior(functions, information, right, gauge, prior)
+            prior = most_likely_prior(SeriesEquations(functions, information, right, gauge), prior)
         variances.append(prior.local.variances[0])
-        more = with_more_places(functions, information, right, gauge, prior)
+        more = with_more_places(SeriesEquations(functions, information, right, gauge), prior)
         assert len(more.local.variances) <= 2
     assert np.mean(variances) == pytest.approx(0.36, rel=0.5)
 
@@ -179,7 +180,9 @@ def test_window_that_nothing_shows_vanishes():
     information, right = equations(functions, uv, values)
     prior = replace(SMOOTH, local=place((416.0, 608.0), 0.05))
     for _ in range(6):
-        prior = most_likely_prior(functions, information, right, np.zeros_like(information), prior)
+        prior = most_likely_prior(
+            SeriesEquations(functions, information, right, np.zeros_like(information)), prior
+        )
     assert prior.local is None or np.sqrt(prior.local.variances[0]) < 0.1
 
 

@@ -32,6 +32,7 @@ from fluoro_calib_ros.estimation.local_signal import (
 from fluoro_calib_ros.estimation.priors import (
     RIDGE,
     Prior,
+    SeriesEquations,
     _most_likely_trend,
     covariance_by_signal,
     covariance_of_series,
@@ -92,7 +93,9 @@ def test_variances_of_the_trend_are_the_most_likely_ones(modes):
     # Orientations are known up to the gauge, whose terms have no prior.
     prior = replace(starting_prior(functions, 1.0), signal=Signal(0.2, 300.0))
     for _ in range(12):
-        prior = _most_likely_trend(functions, information, right, prior)
+        prior = _most_likely_trend(
+            SeriesEquations(functions, information, right, 0 * information), prior
+        )
     here = evidence(functions, information, right, prior)
     exists = prior.trend > 1e-2
     assert 4 <= exists[:14].sum() <= 12 and exists[14] and has_rings(functions, prior)
@@ -105,7 +108,9 @@ def test_variances_of_the_trend_are_the_most_likely_ones(modes):
                 other = replace(prior, trend=trend)
                 assert evidence(functions, information, right, other) < here
     if not modes:
-        again = most_likely_prior(functions, information, right, np.zeros_like(information), prior)
+        again = most_likely_prior(
+            SeriesEquations(functions, information, right, np.zeros_like(information)), prior
+        )
         np.testing.assert_allclose(again.trend, prior.trend, rtol=1e-2)
 
 
@@ -113,7 +118,10 @@ def test_a_prior_without_trend_or_signal_stays():
     functions = Functions(SIZE, -1, 0)
     prior = Prior(SMOOTH, np.zeros(0))
     nothing = np.zeros((0, 0))
-    assert most_likely_prior(functions, nothing, np.zeros(0), nothing, prior) == prior
+    assert (
+        most_likely_prior(SeriesEquations(functions, nothing, np.zeros(0), nothing), prior)
+        == prior
+    )
 
 
 def test_rings_exist_by_the_variances_of_their_terms_alone():
@@ -184,7 +192,7 @@ def estimated_prior(functions, information, right):
     for _ in range(30):
         before = prior
         prior = most_likely_prior(
-            functions, information, right, np.zeros_like(information), prior=before
+            SeriesEquations(functions, information, right, np.zeros_like(information)), before
         )
         if prior.change(before, functions) < 1e-3:
             break
@@ -212,7 +220,7 @@ def test_claims_hold_where_the_signal_is_only_estimated(count, too_small):
         prior = estimated_prior(functions, information, right)
         known = np.linalg.inv(information + prior_precision(functions, prior))
         more = covariance_by_signal(
-            functions, information, right, np.zeros_like(information), prior=prior
+            SeriesEquations(functions, information, right, np.zeros_like(information)), prior
         )
         error = known @ right - field.ravel()
         found.append(normalized_squares(functions, error, (known, known + more)))
@@ -228,7 +236,9 @@ def test_a_series_without_sines_has_no_signal_to_be_estimated():
     information, right = observed(functions, image_points(300), np.zeros((300, 2)))
     prior = Prior(SMOOTH, np.ones(14))
     gauge = np.zeros_like(information)
-    assert not covariance_by_signal(functions, information, right, gauge, prior).any()
+    assert not covariance_by_signal(
+        SeriesEquations(functions, information, right, gauge), prior
+    ).any()
 
 
 # ---- places
@@ -258,7 +268,7 @@ def test_variance_of_a_place_is_the_most_likely_one():
     gauge = np.zeros_like(information)
     prior = Prior(SMOOTH, np.zeros(0), place((416.0, 608.0), 0.3))
     for _ in range(12):
-        prior = most_likely_prior(functions, information, right, gauge, prior)
+        prior = most_likely_prior(SeriesEquations(functions, information, right, gauge), prior)
 
     def at(factor):
         local = replace(prior.local, variances=factor * prior.local.variances)
@@ -284,7 +294,7 @@ def test_more_places_are_those_that_raise_the_likelihood_most(of_v):
     right[m:] *= of_v
     gauge = 1e-3 * np.eye(2 * m)
     prior = Prior(Signal(0.1, 300.0), np.full(14, 4.0))
-    found = with_more_places(functions, information, right, gauge, prior).local
+    found = with_more_places(SeriesEquations(functions, information, right, gauge), prior).local
     own = found.window == 0
     first = LocalSignal(found.nodes[own], found.window[own], found.variances[:1])
     before = evidence(functions, information + gauge, right, prior)
@@ -297,7 +307,9 @@ def test_more_places_are_those_that_raise_the_likelihood_most(of_v):
     beside = replace(first, nodes=first.nodes + [200.0, -200.0])
     assert evidence(functions, information + gauge, right, replace(prior, local=beside)) < before
     # A search with the found places in the prior adds at most one place.
-    more = with_more_places(functions, information, right, gauge, replace(prior, local=found))
+    more = with_more_places(
+        SeriesEquations(functions, information, right, gauge), replace(prior, local=found)
+    )
     assert len(more.local.variances) <= len(found.variances) + 1
 
 
@@ -533,7 +545,7 @@ def test_variances_of_ripples_are_the_most_likely_ones():
     first = Ripples(width, (*[0.0] * 14, 50.0, 50.0, 50.0))
     prior = Prior(Signal(0.8, 500.0, 1e-3, 200.0, ripples=first), np.zeros(0))
     for _ in range(15):
-        prior = most_likely_prior(functions, information, right, gauge, prior)
+        prior = most_likely_prior(SeriesEquations(functions, information, right, gauge), prior)
     ripples = prior.signal.ripples
     assert ripples.bands == (14, 15, 16)
 

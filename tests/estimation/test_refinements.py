@@ -9,8 +9,7 @@ import pytest
 
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.estimation.exposure_terms import exposure_functions
-from fluoro_calib_ros.estimation.fluoroscope_terms import SeriesEquations
-from fluoro_calib_ros.estimation.priors import Prior
+from fluoro_calib_ros.estimation.priors import Prior, SeriesEquations
 from fluoro_calib_ros.estimation.refinements import (
     MAX_MODES,
     MODE_CHANGES,
@@ -32,7 +31,9 @@ def solution(reach=300.0, is_steady=True, level=1e2, own=None):
     prior = Prior(Signal(0.5, reach), np.zeros(14))
     part = SimpleNamespace(number=0, functions=functions, prior=prior, own=own)
     information = level * np.eye(2 * len(functions))
-    equations = SeriesEquations(information, np.zeros(len(information)))
+    equations = SeriesEquations(
+        functions, information, np.zeros(len(information)), 0 * information
+    )
     return Solution([part], None, [equations], is_steady)
 
 
@@ -83,8 +84,7 @@ def test_a_change_is_looked_for_once_at_steady_priors():
 def test_a_prior_is_not_searched_where_that_is_done_or_nothing_is_there(refinement):
     """A given prior was refined when it was estimated; without a place, none is next to one."""
     there = solution()
-    part = there.parts[0]
-    assert refinement.propose(part, there.equations[0], part.prior) is None
+    assert refinement.propose(there.equations[0], there.parts[0].prior) is None
 
 
 @pytest.mark.parametrize('varies', [False, True])

@@ -27,7 +27,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from ..correction.angle_field import PAIRS, AngleField, harmonics
 from ..correction.calibration_record import HARMONICS, ORDERS, SD_GRID, VARIANCES
@@ -44,6 +43,7 @@ from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import information_of_additional, solved_additional
+from ..photogrammetry.rotations import inverse_of_positive
 from ..photogrammetry.unknowns import INTERIOR_SIZE, POSE_SIZE
 from .estimator import GaugeKind, gauge_basis
 
@@ -456,16 +456,15 @@ class _Effects:
         vector = self.design.T @ right
         for _ in range(STEPS):
             variance = self._variance
-            root = _inverse_root(matrix + np.diag(1 / variance))
-            mean = root.T @ (root @ vector)
-            determined = np.clip(1 - np.sum(root**2, axis=0) / variance, 1e-6, 1)
+            covariance = inverse_of_positive(matrix + np.diag(1 / variance))
+            mean = covariance @ vector
+            determined = np.clip(1 - np.diagonal(covariance) / variance, 1e-6, 1)
             squares = np.bincount(self._factor_of, mean**2 / self._unit)
             last = self._factors
             self._factors = squares / np.bincount(self._factor_of, determined)
             if np.max(np.abs(self._factors - last)) < SETTLED * np.max(self._factors):
                 break
-        root = _inverse_root(matrix + np.diag(1 / self._variance))
-        covariance = root.T @ root
+        covariance = inverse_of_positive(matrix + np.diag(1 / self._variance))
         return covariance @ vector, covariance
 
     def explained(self, h: NDArray[np.float64]) -> float:
@@ -475,15 +474,6 @@ class _Effects:
         by_angle = float(np.mean(h**2, axis=0) @ harmonic_variance)
         at_random = float(variance[self.count :].sum()) / len(h)
         return by_angle / (by_angle + at_random)
-
-
-def _inverse_root(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a lower triangular R such that R^T R is the inverse of a positive definite matrix."""
-    factor = np.asfortranarray(np.linalg.cholesky(matrix))
-    root, info = lapack.dtrtri(factor, lower=1, overwrite_c=1)
-    if info:
-        raise np.linalg.LinAlgError('the terms of the exposures are not determined')
-    return root
 
 
 def field_of(

@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.linalg import cho_factor, cho_solve
 
 from ..correction.series import Functions
 from ..correction.terms import ABSENT_VARIANCE, trend_transformation
 from ..photogrammetry.noise import SURE
-from ..photogrammetry.rotations import mirror_lower
+from ..photogrammetry.rotations import inverse_of_positive
 from .estimator import GaugeKind, gauge_rows
 from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_likely_places
 from .parametric import covariance_with_uncertain_terms
@@ -120,7 +120,7 @@ def signal_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
     base = bumps(functions, prior.local.nodes)
     covariance = (base * prior.local.of_bumps) @ base.T
     covariance[np.diag_indices(len(variance))] += variance
-    return cho_solve(cho_factor(covariance, lower=True), np.eye(len(variance)))
+    return inverse_of_positive(covariance)
 
 
 def _terms_that_can_exist(functions: Functions) -> list[int]:
@@ -194,8 +194,7 @@ def _posterior(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return coefficients (2m,) and their covariance (2m, 2m)."""
     precision = equations.with_gauge + prior_precision(equations.functions, prior)
-    factor, _ = cho_factor(precision, lower=True)
-    covariance = mirror_lower(lapack.dpotri(factor, lower=1)[0])
+    covariance = inverse_of_positive(precision)
     return covariance @ equations.right, covariance
 
 
@@ -305,9 +304,8 @@ def with_shown_places(
         precision = signal_precision(functions, candidate)
         with_prior = matrix.copy()
         with_prior[t:, t:] += precision
-        factor = cho_factor(with_prior, lower=True)
-        covariance = cho_solve(factor, np.eye(len(with_prior))[:, t:])[t:]
-        return SineEstimates.of(precision, cho_solve(factor, right)[t:], covariance[None])
+        covariance = inverse_of_positive(with_prior)
+        return SineEstimates.of(precision, (covariance @ right)[t:], covariance[None, t:, t:])
 
     if largest_gain(functions, estimates(prior)) < SUSPECTED_GAIN:
         return prior

@@ -17,11 +17,18 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import cho_factor, lapack
 
 
 def mirror_lower(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the symmetric matrix (n, n) whose lower triangle is that of a matrix."""
     return np.tril(matrix) + np.tril(matrix, -1).T
+
+
+def inverse_of_positive(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverse of a positive definite matrix (n, n); raises LinAlgError for others."""
+    factor, _ = cho_factor(matrix, lower=True)
+    return mirror_lower(lapack.dpotri(factor, lower=1)[0])
 
 
 # Tolerance of R^T R - I for matrices in files: three decimals leave an error of half a thousandth.

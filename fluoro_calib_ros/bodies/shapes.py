@@ -150,6 +150,8 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     findings_on_frame = _wrong_frame(body, places)
     if findings_on_frame:
         return _unchanged(body, findings_on_frame)
+    body = _with_observed_sd(body, places, start)
+    start = _start(body, places) or start
     adjustment = _adjust(body, places, start)
     # A false place also affects the other markers of its exposure, which are then excluded, too.
     while (is_false := _false_places(adjustment)).any():
@@ -178,6 +180,27 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
         exposures=adjustment.exposures,
         findings=tuple(findings),
     )
+
+
+def _with_observed_sd(
+    body: Body, places: BodyPlaces, start: tuple[NDArray[np.float64], NDArray[np.int64]]
+) -> Body:
+    """Return a body whose CT coordinates of unknown sd have that of their fit to the images.
+
+    The frame of a body is that of its coordinates, even if their accuracy was not stated. With f
+    degrees of freedom the variance is that of Student's t, f / (f - 2) times the estimated one.
+    """
+    is_unknown = body.known & ~np.isfinite(body.sd_mm)
+    both = body.known & np.isfinite(start[0]).all(axis=1)
+    freedom = 3 * np.count_nonzero(both) - POSE_SIZE
+    if not is_unknown.any() or freedom <= 2:
+        return body
+    without_ct = replace(body, sd_mm=np.full(len(body.sd_mm), np.inf))
+    shape = _adjust(without_ct, places, start).xyz
+    equal = np.ones(np.count_nonzero(both))
+    squares = _squares_of_fit(body.xyz_mm[both], shape[both], equal)
+    sd = max(np.sqrt(squares / (freedom - 2)), MIN_SD_MM)
+    return replace(body, sd_mm=np.where(is_unknown, sd, body.sd_mm))
 
 
 def _with_true_ct(body: Body, findings: Sequence[Finding]) -> Body:

@@ -68,6 +68,25 @@ def test_coordinates_scatter_as_claimed(fixed_mm):
         assert np.mean(frame) == pytest.approx(1, abs=0.35)
 
 
+def test_coordinates_of_unknown_sd_define_the_frame():
+    """Their sd is that of their fit to the images; the frame scatters as claimed."""
+    rng = np.random.default_rng(9)
+    squares = []
+    for _ in range(40):
+        given = by_ct(rng, CORNERS)
+        body = replace(given, sd_mm=np.full(len(CORNERS), np.inf))
+        shape = estimate_shape(body, recording(rng, CORNERS, 30))
+        rotation, shift = fitted_pose(CORNERS, shape.body.xyz_mm)
+        moved = (CORNERS @ rotation.T + shift).mean(axis=0) - CORNERS.mean(axis=0)
+        away = np.concatenate([moved, vector_from_matrix(rotation)])
+        assert np.abs(moved).max() < 5 * CT_SD_MM
+        squares.append(away @ np.linalg.solve(shape.body.frame_covariance, away) / 6)
+    assert np.mean(squares) == pytest.approx(1, abs=0.35)
+    two = replace(body, xyz_mm=np.where(np.arange(5)[:, None] < 2, body.xyz_mm, np.nan))
+    free = estimate_shape(two, recording(rng, CORNERS, 30)).body
+    assert np.abs(free.xyz_mm.mean(axis=0)).max() < 1  # the frame is that of the markers
+
+
 def test_errors_of_ct_are_recovered():
     """CT errors of 0.1 mm become 0.02 mm or less after 10 s at 60 Hz."""
     rng = np.random.default_rng(2)

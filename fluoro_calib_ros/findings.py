@@ -148,6 +148,7 @@ class Kind(str, Enum):
     BODY_SCALED = 'body_scaled'
     BODY_UNSEEN = 'body_unseen'
     JOINT_APART = 'joint_apart'
+    JOINT_IMPOSSIBLE = 'joint_impossible'
     MARKER_LOOSE = 'marker_loose'
     MARKER_MIGRATED = 'marker_migrated'
     MARKERS_EXCHANGED = 'markers_exchanged'

@@ -26,6 +26,7 @@ from rigs import (
 )
 
 from fluoro_calib_ros.bodies.body import Body
+from fluoro_calib_ros.bodies.joints import Joint
 from fluoro_calib_ros.bodies.shapes import BodyPlaces, _stability, _unseen, estimate_shape
 from fluoro_calib_ros.checks import held_out as held_fit
 from fluoro_calib_ros.checks import inputs, mixed_units, verdict
@@ -62,7 +63,7 @@ from fluoro_calib_ros.jobs import healing, result_folder
 from fluoro_calib_ros.jobs import orientation as orienting
 from fluoro_calib_ros.jobs import reconstruction as reconstructing
 from fluoro_calib_ros.jobs import report as comparing
-from fluoro_calib_ros.jobs.bodies import _apart
+from fluoro_calib_ros.jobs.bodies import _apart, _impossible
 from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
 from fluoro_calib_ros.jobs.extraction import ImageResult, bent_shadows
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
@@ -548,8 +549,15 @@ MAKERS = {
     Kind.BODY_UNSEEN: lambda: _unseen(_body('femur')),
     Kind.JOINT_APART: lambda: _apart(
         Fake(
-            joint=Fake(name='k', proximal='a', distal='b', convention='grood_suntay_knee'),
+            joint=Joint('k', 'a', 'b', 'grood_suntay_knee', side='left'),
             translations=np.array([[0.0, 120.0, 160.0], [np.nan] * 3]),
+        )
+    ),
+    Kind.JOINT_IMPOSSIBLE: lambda: _impossible(
+        Fake(
+            joint=Joint('k', 'a', 'b', 'grood_suntay_knee', side='left'),
+            angles=np.deg2rad([[-60.0, 0, 0], [np.nan] * 3]),
+            status=np.zeros(2),
         )
     ),
     Kind.MARKER_LOOSE: lambda: shape(moves=0.5),
@@ -909,6 +917,10 @@ SENTENCES = {
     Kind.JOINT_APART: (
         'joint k: the origins of a and b are # mm apart: check which body is proximal, and the '
         'landmarks and their unit'
+    ),
+    Kind.JOINT_IMPOSSIBLE: (
+        'joint k: flexion is -# to -# degrees, which no joint reaches (limits -# and #): check '
+        'the side, which body is proximal, and the landmarks'
     ),
     Kind.BODY_UNSEEN: (
         'body femur: no exposure has three of its markers in space: its shape is not estimated'

@@ -13,13 +13,14 @@ and spine", J. Biomech. 35 (2002), and "... part II: shoulder, elbow, wrist and 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
+from ..findings import Kind
 from ..photogrammetry.rotations import (
     ROTATION_TOLERANCE,
     is_rotation,
@@ -44,6 +45,7 @@ class AnatomicalFrame:
     #: (3, 3) columns are the x, y and z axis; unit lengths and right angles to ROTATION_TOLERANCE
     rotation: NDArray[np.float64]
     origin_mm: NDArray[np.float64]  #: (3,)
+    landmarks_mm: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))  #: (n, 3)
 
     def __post_init__(self) -> None:
         rotation = np.array(self.rotation, dtype=float)
@@ -59,6 +61,24 @@ class AnatomicalFrame:
         for name, array in (('rotation', nearest_rotation(rotation)), ('origin_mm', origin)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+
+    @property
+    def extent_mm(self) -> float:
+        """Largest distance between two of its landmarks; infinite without any."""
+        between = self.landmarks_mm[:, None] - self.landmarks_mm
+        return float(np.linalg.norm(between, axis=2).max(initial=0.0)) or np.inf
+
+    def check_body(self, centre_mm: NDArray[np.float64]) -> None:
+        """Raise DataError for a body whose centre (3,) is farther away than its bone is long."""
+        away = np.linalg.norm(self.landmarks_mm - centre_mm, axis=1).min(initial=np.inf)
+        if self.extent_mm < away < np.inf:
+            raise DataError(
+                f'its markers are {away:.3g} mm from the nearest landmark, but the landmarks '
+                f'are only {self.extent_mm:.3g} mm apart: they are in another unit, or not in '
+                'the coordinates of this body',
+                kind=Kind.WRONG_UNIT,
+                numbers={'distance_mm': float(away), 'extent_mm': self.extent_mm},
+            )
 
 
 BODY_FRAME = AnatomicalFrame(np.eye(3), np.zeros(3))
@@ -116,6 +136,8 @@ class LandmarkFrame:
     first: Direction  #: one axis of the frame
     #: spans a plane with the first; its component perpendicular to the first is another axis
     second: Direction
+    #: directions that anatomy puts on the positive side of their axis
+    known: tuple[Direction, ...] = ()
 
     @property
     def landmarks(self) -> tuple[str, ...]:
@@ -138,6 +160,11 @@ LANDMARK_FRAMES = {
         Direction(
             'x', ('medial_posterior_condyle',), ('lateral_posterior_condyle',), lateral=True
         ),
+        known=(
+            Direction(
+                'y', ('medial_posterior_condyle', 'lateral_posterior_condyle'), ('intercondylar',)
+            ),
+        ),
     ),
     'tibia_grood_suntay': LandmarkFrame(
         _EMINENCES,
@@ -148,6 +175,10 @@ LANDMARK_FRAMES = {
         ('hip_centre',),
         Direction('z', ('left_asis',), ('right_asis',)),
         Direction('x', ('left_psis', 'right_psis'), ('left_asis', 'right_asis')),
+        known=(
+            Direction('y', ('hip_centre',), ('left_asis', 'right_asis')),
+            Direction('z', ('left_asis', 'right_asis'), ('hip_centre',), lateral=True),
+        ),
     ),
     'femur_isb': LandmarkFrame(
         ('hip_centre',),
@@ -200,7 +231,7 @@ def frame_of_landmarks(
     """Return the frame of a kind of bone from landmarks (3,) in the coordinates of its body [mm].
 
     kind is a key of LANDMARK_FRAMES, side one of SIDES. Raises DataError for landmarks that are
-    missing, unknown, not finite, coincident or collinear.
+    missing, unknown, not finite, coincident or collinear, and for a bone that anatomy excludes.
     """
     recipe = LANDMARK_FRAMES[kind]
     names = recipe.landmarks
@@ -222,9 +253,19 @@ def frame_of_landmarks(
     orthogonal = second - (second @ first) * first
     if np.linalg.norm(orthogonal) < MIN_SINE:
         raise DataError(f'the landmarks {", ".join(names)} lie on a line')
-    return frame_of_axes(
+    frame = frame_of_axes(
         {recipe.first.axis: first, recipe.second.axis: orthogonal}, _mean(recipe.origin, points)
     )
+    for direction in recipe.known:
+        axis = frame.rotation[:, AXES.index(direction.axis)]
+        sign = -1 if direction.lateral and side == 'left' else 1
+        if sign * (_mean(direction.end, points) - _mean(direction.start, points)) @ axis < 0:
+            start, end = (' and '.join(names) for names in (direction.start, direction.end))
+            raise DataError(
+                f'the way from {start} to {end} is opposite to that in a {side} bone: the side is '
+                'wrong, two landmarks are exchanged, or the bone is mirrored'
+            )
+    return replace(frame, landmarks_mm=np.array(list(points.values())))
 
 
 def _mean(
@@ -278,6 +319,8 @@ class Convention:
     proximal_landmarks: str = ''
     distal_landmarks: str = ''
     origins_meet: bool = False  #: whether both origins are at the joint
+    #: least and largest value of each angle [deg] that no joint exceeds
+    limits_deg: tuple[tuple[float, float], ...] = ((-np.inf, np.inf),) * 3
 
     @property
     def is_euler(self) -> bool:
@@ -312,8 +355,23 @@ def _sequences() -> Iterator[Convention]:
         )
 
 
-def _isb(name: str, angles: str, translations: str, proximal: str, distal: str) -> Convention:
+# Limits of angles [deg] that the most mobile persons do not reach. A hinge bends backwards by less
+# than 30 degrees (a hyperextension of 10 is normal, one of 20 rare). Axes of two bones that point
+# to opposite sides are 90 degrees apart or more.
+_HINGE = (-30.0, 180.0)
+_SAME_SIDE = (-90.0, 90.0)
+_FREE = (-np.inf, np.inf)
+
+
+def _isb(
+    name: str,
+    angles: str,
+    translations: str,
+    landmarks: tuple[str, str],
+    limits: tuple[tuple[float, float], ...],
+) -> Convention:
     """Return an ISB convention: flexion about z, floating axis x, rotation about y."""
+    proximal, distal = landmarks
     first, second, third = angles.split()
     lateral, anterior, axial = translations.split()
     return Convention(
@@ -325,6 +383,7 @@ def _isb(name: str, angles: str, translations: str, proximal: str, distal: str) 
         proximal_landmarks=proximal,
         distal_landmarks=distal,
         origins_meet=name in ('isb_hip', 'isb_ankle'),
+        limits_deg=limits,
     )
 
 
@@ -356,23 +415,36 @@ _CLINICAL = (
         proximal_landmarks='femur_grood_suntay',
         distal_landmarks='tibia_grood_suntay',
         origins_meet=True,
+        limits_deg=(_HINGE, _SAME_SIDE, _SAME_SIDE),
     ),
-    _isb('isb_hip', 'flexion adduction internal_rotation', _SHIFTS, 'pelvis_isb', 'femur_isb'),
+    _isb(
+        'isb_hip',
+        'flexion adduction internal_rotation',
+        _SHIFTS,
+        ('pelvis_isb', 'femur_isb'),
+        ((-90.0, 180.0), _SAME_SIDE, _SAME_SIDE),
+    ),
     # The frame of the calcaneus is that of the tibia in neutral position.
     _isb(
         'isb_ankle',
         'dorsiflexion inversion internal_rotation',
         'lateral_shift anterior_shift compression',
-        'tibia_isb',
-        '',
+        ('tibia_isb', ''),
+        (_SAME_SIDE,) * 3,
     ),
-    _isb('isb_elbow', 'flexion adduction pronation', _SHIFTS, 'humerus_isb', 'forearm_isb'),
+    _isb(
+        'isb_elbow',
+        'flexion adduction pronation',
+        _SHIFTS,
+        ('humerus_isb', 'forearm_isb'),
+        (_HINGE, _SAME_SIDE, _FREE),
+    ),
     _isb(
         'isb_wrist',
         'flexion ulnar_deviation pronation',
         'radial_shift volar_shift proximal_shift',
-        'radius_isb',
-        'metacarpal_isb',
+        ('radius_isb', 'metacarpal_isb'),
+        ((-120.0, 120.0), _SAME_SIDE, _SAME_SIDE),
     ),
     _SHOULDER,
     replace(

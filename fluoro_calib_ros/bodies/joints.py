@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..brief import brief_repr
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from ..rows import chosen_rows
 from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame, Convention, convention
-from .body import BodyPoses, PoseStatus
+from .body import Body, BodyPoses, PoseStatus
 
 # Distance from gimbal lock in standard deviations. At this distance the first angle has a standard
 # deviation of 0.2 rad (11 degrees), and one in two million of its errors crosses the lock.
@@ -237,6 +237,21 @@ def check_joints(joints: Sequence[Joint], bodies: Iterable[str]) -> None:
                 f'joint {joint.name} closes a cycle: {joint.proximal} is also distal of '
                 f'{joint.distal}'
             )
+
+
+def check_frames(joint: Joint, bodies: Iterable[Body]) -> None:
+    """Raise DataError for a given frame that is not in the coordinates of its body."""
+    frames = {joint.proximal: joint.proximal_frame, joint.distal: joint.distal_frame}
+    for body in bodies:
+        frame = frames.get(body.name, BODY_FRAME)
+        if frame is BODY_FRAME:
+            continue
+        with ErrorsAt(f'joint {joint.name}, frame of {body.name}'):
+            if np.count_nonzero(body.known) < 3:
+                raise DataError(
+                    'three markers of the body have no coordinates, in which a frame can be given'
+                )
+            frame.check_body(body.centre)
 
 
 def _check_poses(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> None:

@@ -46,7 +46,7 @@ from ..bodies.anatomical_frames import (
 )
 from ..bodies.body import STATUS_NAMES as POSE_STATUS
 from ..bodies.body import Body, BodyPoses, check_bodies
-from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_joints
+from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_frames, check_joints
 from ..bodies.tracking import TrackedExposure
 from ..errors import DataError, ErrorsAt
 from ..exposures.names import Names
@@ -179,8 +179,10 @@ def read_joints(path: PathLike, bodies: Iterable[Body | str]) -> tuple[JointEntr
         raise DataError(f'{path}: {len(tables)} joints; the limit is {MAX_JOINTS}')
     entries = tuple(_entry(path, n, table) for n, table in enumerate(tables, 1))
     with ErrorsAt(path):
-        names = [body if isinstance(body, str) else body.name for body in bodies]
-        check_joints([entry.joint for entry in entries], names)
+        by_name = {body if isinstance(body, str) else body.name: body for body in bodies}
+        check_joints([entry.joint for entry in entries], by_name)
+        for entry in entries:
+            check_frames(entry.joint, [b for b in by_name.values() if isinstance(b, Body)])
     return entries
 
 

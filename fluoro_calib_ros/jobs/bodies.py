@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.anatomical_frames import convention
+from ..bodies.anatomical_frames import BODY_FRAME, convention
 from ..bodies.body import AXIS_MM, STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
-from ..bodies.joints import JointMotion, joint_motion, with_neutral
+from ..bodies.joints import Joint, JointMotion, JointStatus, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
 from ..brief import brief_repr
@@ -136,6 +136,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SMOOTH = ('auto', 'none', 'lag', 'butterworth')
+# Findings on coordinates in whose frame no pose has a meaning.
+WRONG_COORDINATES = (Kind.BODY_MIRRORED, Kind.WRONG_UNIT)
 SHAPE_EXPOSURES = 600  # maximum number, evenly spread over a recording, used to estimate shapes
 
 
@@ -301,8 +303,9 @@ def track_bodies(
     Raises
     ------
     DataError
-        For frames that cannot be paired or corrected, bodies without a shape, a recording without
-        times, and one that shows no body.
+        For frames that cannot be paired or corrected, bodies without a shape or with coordinates
+        that are mirrored or in another unit, a recording without times, and one that shows no
+        body.
     """
     options = options or BodiesOptions()
     check_bodies(bodies)
@@ -312,9 +315,7 @@ def track_bodies(
         frames, calibrations, orientation, options, lambda done, total: step(done, 2 * total)
     )
     exposures = recording.frames
-    shapes = [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
-    if options.estimate_shapes:
-        shapes = estimated_shapes(bodies, recording, calibrations)
+    shapes = _shapes(bodies, recording, calibrations, options)
     solvable = solvable_bodies([shape.body for shape in shapes])
     lag = options.lag if options.smooth == 'lag' else None
     tracker = BodyTracker(orientation, solvable, options.reject, lag)
@@ -331,12 +332,8 @@ def track_bodies(
     if options.neutral is not None:
         rest_poses = _poses_alone(options.neutral, calibrations, orientation, solvable, options)
         joints = [replace(entry, neutral=(0, sys.maxsize)) for entry in joints]
-    findings = [finding for shape in shapes for finding in shape.findings]
-    unseen_places = {finding.place for finding in findings if finding.kind is Kind.BODY_UNSEEN}
-    unseen = [_unseen(body_poses) for body_poses in poses if not body_poses.known.any()]
-    findings += [finding for finding in unseen if finding.place not in unseen_places]
     motions = _joints(joints, poses, rest_poses or poses)
-    findings += filter(None, map(_apart, motions))
+    findings = [*_on_bodies(shapes, poses), *_on_joints(joints, motions, poses)]
     return BodiesOutcome(
         tuple(shapes),
         tracked,
@@ -401,6 +398,22 @@ def estimated_shapes(
     ids = [views.target_id for views in sampled]
     points = [_split(views, sides) for views in sampled]
     return [estimate_shape(body, places_of(body, ids, points)) for body in bodies]
+
+
+def _shapes(
+    bodies: Sequence[Body],
+    recording: ReconstructionOutcome,
+    calibrations: Calibrations,
+    options: BodiesOptions,
+) -> list[EstimatedShape]:
+    """Return estimated or given shapes. Raises DataError for coordinates that are wrong."""
+    shapes = estimated_shapes(bodies, recording, calibrations)
+    wrong = [f for shape in shapes for f in shape.findings if f.kind in WRONG_COORDINATES]
+    if wrong:
+        raise DataError(*wrong)
+    if options.estimate_shapes:
+        return shapes
+    return [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
 
 
 def _split(
@@ -474,6 +487,30 @@ def _joints(
     return out
 
 
+def _on_bodies(shapes: Sequence[EstimatedShape], poses: Sequence[BodyPoses]) -> list[Finding]:
+    """Return findings on shapes, and on bodies without poses, each body once."""
+    findings = [finding for shape in shapes for finding in shape.findings]
+    unseen_places = {finding.place for finding in findings if finding.kind is Kind.BODY_UNSEEN}
+    unseen = [_unseen(body_poses) for body_poses in poses if not body_poses.known.any()]
+    return findings + [finding for finding in unseen if finding.place not in unseen_places]
+
+
+def _on_joints(
+    requests: Sequence[JointEntry], motions: Sequence[JointMotion], poses: Sequence[BodyPoses]
+) -> list[Finding]:
+    """Return findings on joints that no anatomy has.
+
+    Angles relative to a neutral position may have any sign: those of the given frames are judged.
+    """
+    absolute = [
+        replace(request, neutral=None)
+        for request in requests
+        if request.neutral is None or _has_frames(request.joint)
+    ]
+    doubts = [*map(_apart, motions), *map(_impossible, _joints(absolute, poses, poses))]
+    return [finding for finding in doubts if finding is not None]
+
+
 def _unseen(poses: BodyPoses) -> Finding:
     return Finding(
         Kind.BODY_UNSEEN,
@@ -485,27 +522,62 @@ def _unseen(poses: BodyPoses) -> Finding:
 
 
 # Largest distance of two origins at one joint [mm]: twice that in the knee, or from the acromial
-# angle to the head of the humerus, of adults (30 to 50 mm).
+# angle to the head of the humerus, of adults (30 to 50 mm). In a bone of any size, it is less than
+# half the distance between its landmarks, and it is exceeded in no more than a few exposures.
 MAX_ORIGINS_MM = 100.0
+MAX_ORIGINS = 0.5
+FEW = 0.05  # share of exposures whose poses may be wrong
+
+
+def _has_frames(joint: Joint) -> bool:
+    """Return whether both frames of a joint are given; their axes and origins are then judged."""
+    return all(frame is not BODY_FRAME for frame in (joint.proximal_frame, joint.distal_frame))
+
+
+def _severity(joint: Joint) -> Severity:
+    return Severity.ERROR if _has_frames(joint) else Severity.WARNING
 
 
 def _apart(motion: JointMotion) -> Finding | None:
     """Return a finding if the bones of a joint do not meet, or None."""
-    distance = np.linalg.norm(motion.translations, axis=1)
-    if not convention(motion.joint.convention).origins_meet or not np.isfinite(distance).any():
-        return None
-    median = float(np.nanmedian(distance))
-    if median <= MAX_ORIGINS_MM:
-        return None
     joint = motion.joint
+    distance = np.linalg.norm(motion.translations, axis=1)
+    if not convention(joint.convention).origins_meet or not np.isfinite(distance).any():
+        return None
+    largest = float(np.nanquantile(distance, 1 - FEW))
+    extent = min(joint.proximal_frame.extent_mm, joint.distal_frame.extent_mm)
+    if largest <= min(MAX_ORIGINS_MM, MAX_ORIGINS * extent):
+        return None
     return Finding(
         Kind.JOINT_APART,
-        f'the origins of {joint.proximal} and {joint.distal} are {median:.0f} mm apart',
+        f'the origins of {joint.proximal} and {joint.distal} are {largest:.0f} mm apart',
         place=Place(name=f'joint {joint.name}'),
         advice='check which body is proximal, and the landmarks and their unit',
-        severity=Severity.WARNING,
-        numbers={'distance_mm': median},
+        severity=_severity(joint),
+        numbers={'distance_mm': largest},
     )
+
+
+def _impossible(motion: JointMotion) -> Finding | None:
+    """Return a finding if an angle is outside the limits of anatomy, or None."""
+    joint = motion.joint
+    of = convention(joint.convention)
+    known = np.isfinite(motion.angles).all(axis=1) & (motion.status != JointStatus.GIMBAL)
+    if not known.any():
+        return None
+    degrees = np.rad2deg(np.quantile(motion.angles[known], (FEW, 1 - FEW), axis=0).T)
+    for name, (least, most), (low, high) in zip(of.angles, degrees, of.limits_deg):
+        if least < low or most > high:
+            return Finding(
+                Kind.JOINT_IMPOSSIBLE,
+                f'{name} is {least:.0f} to {most:.0f} degrees, which no joint reaches (limits '
+                f'{low:.0f} and {high:.0f})',
+                place=Place(name=f'joint {joint.name}'),
+                advice='check the side, which body is proximal, and the landmarks',
+                severity=_severity(joint),
+                numbers={'least_deg': float(least), 'most_deg': float(most)},
+            )
+    return None
 
 
 # Result folder of the bodies of a recording.

@@ -544,6 +544,21 @@ def test_frames_of_landmarks(kind, side):
     np.testing.assert_allclose(frame.origin_mm, np.mean(named, axis=0), atol=1e-9)
 
 
+@pytest.mark.parametrize('side', ['left', 'right'])
+@pytest.mark.parametrize('kind', ['femur_grood_suntay', 'pelvis_isb'])
+def test_bones_of_the_other_side_and_mirrored_bones_are_refused(kind, side):
+    bone = mannequin(kind, side)
+    mirrored = {name: x * [-1, 1, 1] for name, x in bone.items()}
+    other = 'left' if side == 'right' else 'right'
+    for landmarks, named in ((bone, other), (mirrored, side)):
+        with pytest.raises(DataError, match='the side is wrong'):
+            frame_of_landmarks(kind, landmarks, named)
+    pair = [name for name in bone if name.startswith(('medial', 'lateral', 'left', 'right'))][:2]
+    exchanged = {**bone, pair[0]: bone[pair[1]], pair[1]: bone[pair[0]]}
+    with pytest.raises(DataError, match='two landmarks are exchanged'):
+        frame_of_landmarks(kind, exchanged, side)
+
+
 def test_the_second_landmark_direction_only_spans_a_plane():
     """The mechanical axis of the femur is kept; the posterior condyles are made perpendicular."""
     landmarks = mannequin('femur_grood_suntay', 'right')

@@ -224,36 +224,53 @@ def test_a_body_whose_markers_nobody_sees_is_named(knee, tmp_path, capsys):
     assert {row['status'] for row in poses} == {'FAILED'} and not any(p['x_mm'] for p in poses)
 
 
-def test_mirrored_coordinates_are_not_a_success(knee, tmp_path, capsys):
-    """The poses are written, and the exit status is that of a verdict that is not pass."""
+def changed_bodies(knee, path, change):
+    """Write the bodies with changed coordinates (n, 3); return the path."""
     given = rows(knee / 'bodies.csv')
+    xyz = change(np.array([[float(row[name]) for name in 'xyz'] for row in given]))
     lines = [
-        ','.join(
-            [row['body'], row['marker'], str(-float(row['x'])), row['y'], row['z'], row['sd']]
-        )
-        for row in given
+        ','.join(map(str, (row['body'], row['marker'], *place, row['sd'])))
+        for row, place in zip(given, xyz.tolist())
     ]
-    (tmp_path / 'bodies.csv').write_text('\n'.join(['body,marker,x,y,z,sd', *lines]) + '\n')
-    arguments = (
-        *('bodies', knee / 'walking', '--bodies', tmp_path / 'bodies.csv', '--smooth', 'none'),
-        *('--calibration', knee / 'result', '--out', tmp_path / 'motion'),
-    )
-    assert run(*arguments, '--exit-zero') == 0
-    capsys.readouterr()
-    assert run(*arguments, '--json') == 3
-    document = json.loads(capsys.readouterr().out)
-    assert 'body_mirrored' in [f['kind'] for f in document['findings']]
+    path.write_text('\n'.join(['body,marker,x,y,z,sd', *lines]) + '\n')
+    return path
+
+
+@pytest.mark.parametrize(
+    ('factor', 'cause'), [((-1, 1, 1), 'mirrored'), ((0.1, 0.1, 0.1), 'in cm, not in mm')]
+)
+@pytest.mark.parametrize('kept', [(), ('--keep-shapes',)])
+def test_coordinates_in_which_no_pose_has_a_meaning_are_refused(
+    knee, tmp_path, capsys, factor, cause, kept
+):
+    changed = changed_bodies(knee, tmp_path / 'bodies.csv', lambda xyz: xyz * factor)
+    options = ('--bodies', changed, '--smooth', 'none', *kept)
+    assert bodies(knee, tmp_path / 'motion', *options) == 1
+    err = capsys.readouterr().err
+    assert cause in err and 'body femur' in err and 'body tibia' in err
+    assert not (tmp_path / 'motion').exists()
+
+
+def test_angles_that_no_knee_reaches_are_not_a_success(knee, tmp_path, capsys):
+    """The plateau with medial and lateral exchanged: its axes point to the other side."""
+    text = (knee / 'joints.toml').read_text()
+    exchanged = {'medial_plateau': 'lateral_plateau', 'lateral_plateau': 'medial_plateau'}
+    text = re.sub('|'.join(exchanged), lambda match: exchanged[match[0]], text)
+    (tmp_path / 'joints.toml').write_text(text)
+    options = ('--joints', tmp_path / 'joints.toml', '--json')
+    for neutral in ((), ('--neutral', knee / 'walking')):
+        assert bodies(knee, tmp_path / 'motion', *options, *neutral) == 3
+        (found,) = json.loads(capsys.readouterr().out)['findings']
+        assert found['kind'] == 'joint_impossible' and abs(found['numbers']['least_deg']) > 90
 
 
 @pytest.mark.filterwarnings('error')
 def test_bodies_and_joints_without_poses_have_no_figures(knee, tmp_path, capsys):
-    """Coordinates in cm fit nowhere; nothing is printed about poses and angles that are not."""
-    header, *lines = (knee / 'bodies.csv').read_text().splitlines()
-    cells = [line.split(',') for line in lines]
-    in_cm = [[*row[:2], *(f'{float(x) / 10}' for x in row[2:5]), row[5]] for row in cells]
-    (tmp_path / 'cm.csv').write_text('\n'.join([header, *map(','.join, in_cm)]))
-    files = ('--bodies', tmp_path / 'cm.csv', '--joints', knee / 'joints.toml')
-    assert bodies(knee, tmp_path / 'motion', *files) == 3
+    """Nothing is printed about poses and angles that are not."""
+    text = (knee / 'bodies.csv').read_text().replace(',30', ',90')
+    (tmp_path / 'unseen.csv').write_text(text.replace('tibia,90', 'tibia,30'))
+    files = ('--bodies', tmp_path / 'unseen.csv', '--joints', knee / 'joints.toml')
+    assert bodies(knee, tmp_path / 'motion', *files) == 0
     out = capsys.readouterr().out
     assert 'femur: no pose' in out and 'knee: no angles' in out and 'nan' not in out
 

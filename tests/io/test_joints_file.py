@@ -7,10 +7,13 @@ import csv
 
 import numpy as np
 import pytest
+import rigs
 
 from fluoro_calib_ros.bodies.anatomical_frames import BODY_FRAME
+from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.joints import Joint, JointMotion, JointStatus
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.bodies import joint_table, read_joints
 from fluoro_calib_ros.limits import DOCUMENT_BYTES, MAX_DEPTH, MAX_JOINTS
 
@@ -70,6 +73,28 @@ def test_joints_are_read(tmp_path):
     plain = KNEE[: KNEE.index('[joint.proximal_frame')]
     (entry,) = read_joints(written(tmp_path, plain), BODIES)
     assert entry.joint.proximal_frame is BODY_FRAME
+
+
+def body(name, xyz):
+    return Body(name, np.arange(len(xyz)) + 10 * len(name), xyz, np.full(len(xyz), 0.1))
+
+
+def test_a_frame_is_in_the_coordinates_of_its_body(tmp_path):
+    """Landmarks in cm, or of another bone, are far from the markers; a frame needs coordinates."""
+    near = np.array([[20.0, 0, 50], [0, 20, 60], [-20, 0, 70], [0, -20, 150]])
+    tibia = body('tibia', near)
+    read_joints(written(tmp_path, KNEE), [body('femur', near), tibia])
+    with rigs.refused(Kind.WRONG_UNIT, extent_mm=pytest.approx(400.8, abs=1)) as caught:
+        read_joints(written(tmp_path, KNEE), [body('femur', near + [0, 0, 1000]), tibia])
+    assert 'joints.toml: joint knee, frame of femur' in str(caught.value)
+    in_cm = KNEE.replace('[0, 0, 400]', '[0, 0, 40]').replace('25, -20', '2.5, -2')
+    with rigs.refused(Kind.WRONG_UNIT):
+        read_joints(written(tmp_path, in_cm), [body('femur', near), tibia])
+    unknown = body('femur', np.where(np.arange(4)[:, None] < 2, near, np.nan))
+    with pytest.raises(DataError, match='frame of femur: three markers'):
+        read_joints(written(tmp_path, KNEE), [unknown, tibia])
+    plain = KNEE[: KNEE.index('[joint.proximal_frame')]
+    read_joints(written(tmp_path, plain), [unknown, tibia])
 
 
 @pytest.mark.parametrize(

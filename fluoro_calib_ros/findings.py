@@ -40,6 +40,7 @@ class Kind(str, Enum):
     HELD_OUT = 'held_out'
     ORIENTATION = 'orientation'
     PRECISION = 'precision'
+    SCALE = 'scale'
     SHAPE = 'shape'
     TAKEN_ON_TRUST = 'taken_on_trust'
     VALIDATION = 'validation'

@@ -32,6 +32,7 @@ from fluoro_calib_ros.checks import held_out as held_fit
 from fluoro_calib_ros.checks import inputs, mixed_units, verdict
 from fluoro_calib_ros.checks import inputs as plausibility
 from fluoro_calib_ros.checks import rig as rig_checks
+from fluoro_calib_ros.checks import survey as survey_checks
 from fluoro_calib_ros.checks.drift_charts import ERROR, WARN
 from fluoro_calib_ros.checks.drift_evidence import DriftEstimate
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
@@ -409,6 +410,14 @@ MAKERS = {
             Kind.WORST_AREA,
         )
     },
+    Kind.SCALE: lambda: survey_checks._check_scale(
+        Fake(
+            scale=1.03,
+            scale_sd=1e-4,
+            given_mm=PHANTOM.xyz_mm,
+            given_sd_mm=np.full(len(PHANTOM.xyz_mm), 0.1),
+        )
+    ),
     Kind.GIVEN_INTERIOR: wrong_given_interior,
     Kind.VALIDATION: no_validation,
     Kind.COPIED_EXPOSURE: lambda: _without_copies(
@@ -617,6 +626,11 @@ SENTENCES = {
         'fluoroscope a: the correction has a standard deviation of # px, at an image noise of '
         '# px: it makes the errors of corrected points # % larger: choose another model '
         '(--model auto), or take # more exposures (there are #), or a phantom with more beads'
+    ),
+    Kind.SCALE: (
+        'by the measured distances the beads are # % further apart than by the given '
+        'coordinates: check for an error that all distances share, such as that of the caliper; '
+        'if the given coordinates have another scale, give them a larger sd'
     ),
     Kind.SHAPE: (
         'the survey of the phantom is strained relative to the images by # % along (#, #, #), '

@@ -97,8 +97,26 @@ def check_survey(beads: SurveyedBeads) -> list[Check]:
     return [
         _check_intersection(beads),
         _check_distances(beads),
+        *([] if beads.scaled is None else [_check_scale(beads)]),
         _check_layout(beads),
         _check_precision(beads),
+    ]
+
+
+def trusted_scale(beads: SurveyedBeads) -> list[Finding]:
+    """Return a note on the error of all distances that nothing would show."""
+    if beads.scaled is None:
+        return []
+    unseen = OFF_SD * _given_scale_sd(beads)
+    return [
+        Finding(
+            Kind.TAKEN_ON_TRUST,
+            'the scale is that of the measured distances: an error that they share, such as that '
+            f'of the caliper, is not seen if it is below {100 * unseen:.2f} %',
+            Place(name=''),
+            severity=Severity.NOTE,
+            numbers={'scale': unseen},
+        )
     ]
 
 
@@ -230,6 +248,28 @@ def _check_distances(beads: SurveyedBeads) -> Check:
         limit=float(chdtri(beads.scaled.freedom, CONTRADICTION)),
         unit='chi2',
     )
+
+
+def _check_scale(beads: SurveyedBeads) -> Check:
+    """Compare the scale of the distances with that of the given coordinates."""
+    change = beads.scale - 1
+    return Check(
+        Kind.SCALE,
+        f'by the measured distances the beads are {100 * change:+.2f} % further apart than by the '
+        'given coordinates',
+        advice='check for an error that all distances share, such as that of the caliper; if the '
+        'given coordinates have another scale, give them a larger sd',
+        numbers={'scale': beads.scale, 'given_scale_sd': _given_scale_sd(beads)},
+        value=abs(change),
+        limit=OFF_SD * float(np.hypot(_given_scale_sd(beads), beads.scale_sd)),
+        unit='relative',
+    )
+
+
+def _given_scale_sd(beads: SurveyedBeads) -> float:
+    """Return the change of scale that moves the given coordinates by their sd (RMS)."""
+    arm = beads.given_mm - beads.given_mm.mean(axis=0)
+    return float(np.sqrt(np.mean(beads.given_sd_mm**2) / np.mean(arm**2)))
 
 
 def _check_layout(beads: SurveyedBeads) -> Check:

@@ -17,7 +17,13 @@ import numpy as np
 
 from ..brief import brief_repr
 from ..checks.check import Check, Validation, not_made, verdict_of
-from ..checks.survey import check_survey, check_survey_halves, displaced, unsurveyed
+from ..checks.survey import (
+    check_survey,
+    check_survey_halves,
+    displaced,
+    trusted_scale,
+    unsurveyed,
+)
 from ..errors import DataError
 from ..estimation.calibrate import calibrate_request
 from ..estimation.options import CalibrationOptions, CalibrationRequest
@@ -142,7 +148,13 @@ def survey(
     return SurveyOutcome(
         _phantom(request, beads),
         beads,
-        Validation(verdict_of(checks), tuple(checks), {}, time.perf_counter() - began),
+        Validation(
+            verdict_of(checks),
+            tuple(checks),
+            {},
+            time.perf_counter() - began,
+            notes=tuple(trusted_scale(beads)),
+        ),
         (*result.findings, *left_out, *([] if displacement is None else [displacement])),
         result,
     )

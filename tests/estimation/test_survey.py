@@ -17,6 +17,7 @@ from fluoro_calib_ros.checks.survey import (
     check_survey,
     check_survey_halves,
     displaced,
+    trusted_scale,
     unsurveyed,
 )
 from fluoro_calib_ros.errors import DataError
@@ -291,6 +292,7 @@ def test_a_perturbed_phantom_is_recovered_within_its_claims():
     rig, _, outcome = surveyed()
     beads = outcome.beads
     assert outcome.validation.verdict == 'pass'
+    assert rigs.kinds(outcome.validation.notes) == [Kind.TAKEN_ON_TRUST]
     assert 0.8 < nse(beads, rig) < 1.25
     assert abs(scale_error(beads, rig)) < 3
     assert beads.scale_sd < 5e-4
@@ -340,6 +342,23 @@ def test_distances_and_coordinates_in_different_units_are_named(
     assert f'in {of_distances or of_coordinates}, not in mm' in check.cause
     assert check.cause.startswith('the measured' if of_distances else 'the given')
     assert displaced(beads) is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('factor', [0.97, 1.03])
+def test_distances_that_are_wrong_alike_contradict_coordinates_that_are_not_rough(factor):
+    rig, _, outcome = surveyed()
+    distances = [replace(d, length_mm=factor * d.length_mm) for d in measured(rig)]
+    beads = surveyed_beads(outcome.result, rough(rig), distances)
+    check = checked(beads, Kind.SCALE)
+    assert check.passed is False and verdict_of(check_survey(beads)) == 'fail'
+    assert check.numbers['scale'] == pytest.approx(factor * GROWN, abs=0.002)
+    # Coordinates of 3 mm may themselves have this scale: the verdict says what it rests on.
+    vague = replace(rough(rig), sd_mm=np.full(len(rig.true_mm), 3.0))
+    beads = surveyed_beads(outcome.result, vague, distances)
+    assert checked(beads, Kind.SCALE).passed and verdict_of(check_survey(beads)) == 'pass'
+    (trusted,) = trusted_scale(beads)
+    assert trusted.kind is Kind.TAKEN_ON_TRUST and trusted.numbers['scale'] > 0.03
 
 
 @pytest.mark.long

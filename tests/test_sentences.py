@@ -74,9 +74,9 @@ from fluoro_calib_ros.reconstruction import epipolar, lost_targets, observed_noi
 from fluoro_calib_ros.reconstruction.reconstruct import RigRecording
 from fluoro_calib_ros.reconstruction.timing import (
     Delay,
-    Motion,
+    LostFrames,
     delay_finding,
-    find_lost_frame,
+    lost_frames_finding,
 )
 
 PHANTOM = rig().phantom
@@ -217,16 +217,6 @@ def moved_rig():
     present = orientation()
     shifted = present.position_mm + np.array([[0.0, 0, 0], [20.0, 0, 0]])
     return orienting._change(present, replace(present, position_mm=shifted))
-
-
-def lost_frame():
-    """Of 20 exposures, those after the tenth fit the previous frames of b."""
-    exposure = np.arange(20)
-    residual = np.full((20, 3), 9.0)
-    residual[:10, 1] = residual[10:, 0] = 0.1
-    one = np.ones(20)
-    motion = Motion(exposure, exposure, residual, one, one, by_rig=np.ones((20, 9)))
-    return find_lost_frame(('a', 'b'), motion)
 
 
 def trial(kind):
@@ -458,7 +448,7 @@ MAKERS = {
     Kind.WEAK_INTERSECTION: weak_intersection,
     Kind.DUPLICATE_NAME: lambda: raised(inputs.validate_names, ('a', 'A')),
     Kind.FRAMES_SHIFTED: lambda: trial(Kind.FRAMES_SHIFTED),
-    Kind.FRAME_LOST: lost_frame,
+    Kind.FRAME_LOST: lambda: lost_frames_finding([LostFrames('b', 12, 1)]),
     Kind.FRAMES_DELAYED: lambda: delay_finding(('a', 'b'), Delay(-0.25, 0.01, 1.0), 0.01),
     Kind.IDS_REVERSED: lambda: inputs.CONFUSIONS[2][0],
     Kind.IDS_SHIFTED: lambda: inputs.CONFUSIONS[0][0],

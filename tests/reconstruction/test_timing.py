@@ -78,8 +78,15 @@ def test_a_fluoroscope_that_is_late_or_early_is_named(steps, names):
     assert finding.numbers['interval_s'] == pytest.approx(1 / RATE_HZ, rel=1e-6)
 
 
-@pytest.mark.parametrize('shift', [1, -1])
-def test_frame_numbers_that_are_off_by_one_are_named(shift):
+@pytest.mark.parametrize('steps', [5, 6, 17])
+def test_a_delay_of_more_than_an_interval_is_measured(steps):
+    finding = found(recorded(steps))
+    assert finding.kind is Kind.FRAMES_DELAYED
+    assert abs(finding.numbers['frames'] - steps / 4) < 4 * finding.numbers['sd'] < 0.1
+
+
+@pytest.mark.parametrize('shift', [1, -1, 2, -5, 12])
+def test_frame_numbers_that_are_off_are_named(shift):
     frames = recorded(0)
     renumbered = [replace(frame, number=frame.number + shift) for frame in frames['b']]
     finding = found({**frames, 'b': renumbered})
@@ -127,17 +134,38 @@ def test_a_moved_fluoroscope_is_no_delay():
     assert found(recorded(0), orientation=moved) is None
 
 
-def without(frames, name, lost):
-    """Frames of which a fluoroscope has lost one, numbered without a gap."""
-    kept = [replace(f, number=f.number - (f.number > lost)) for f in frames[name]]
-    return {**frames, name: [f for f, old in zip(kept, frames[name]) if old.number != lost]}
+def without(frames, name, *lost):
+    """Frames of which a fluoroscope has lost some, numbered without a gap."""
+    kept = [frame for frame in frames[name] if frame.number not in lost]
+    first = frames[name][0].number
+    return {**frames, name: [replace(f, number=first + row) for row, f in enumerate(kept)]}
 
 
+@pytest.mark.parametrize('exposure', [4, 60, 114])
 @pytest.mark.parametrize('name', ['a', 'b'])
-def test_a_lost_frame_is_named(name):
-    finding = found(without(recorded(0), name, 60))
+def test_a_lost_frame_is_named(name, exposure):
+    finding = found(without(recorded(0), name, exposure))
     assert finding.kind is Kind.FRAME_LOST and finding.place.fluoroscopes == (name,)
-    assert finding.numbers == {'exposure': 60, 'frames': 1}
+    assert finding.numbers == {'exposure': exposure, 'frames': 1}
+
+
+@pytest.mark.parametrize('lost', [(60, 61, 62), (40, 80), (30, 60, 90), (40, 41, 80)])
+def test_several_lost_frames_are_named(lost):
+    finding = found(without(recorded(0), 'b', *lost))
+    assert finding.kind is Kind.FRAME_LOST and finding.place.fluoroscopes == ('b',)
+    assert finding.numbers == {'exposure': lost[0], 'frames': len(lost)}
+    # Frames of a burst are one loss; numbers of a count exposures, those of b have lost some.
+    firsts = tuple(number for number in lost if number - 1 not in lost)
+    assert finding.place.exposures == firsts
+    finding = found(without(without(recorded(0), 'b', 80), 'a', 40))
+    assert finding.place.fluoroscopes == ('a', 'b') and finding.numbers['frames'] == 2
+
+
+def test_a_lost_frame_of_a_long_recording_is_named_with_its_exposure():
+    """It is found between the exposures that are tested first, and is no delay by a half."""
+    finding = found(without(recorded(0, seconds=20.0), 'b', 603))
+    assert finding.kind is Kind.FRAME_LOST
+    assert finding.numbers == {'exposure': 603, 'frames': 1}
 
 
 def test_a_lost_frame_is_not_named_beside_another_fault():

@@ -35,7 +35,7 @@ from ..photogrammetry.precision import (
 from ..photogrammetry.rig_orientation import KnownOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..rows import joined_rows
-from .constraints import relative_orientations
+from .constraints import connected_frames, relative_orientations
 from .fixed_calibration import (
     SolvedNetwork,
     fixed_corrections,
@@ -243,6 +243,8 @@ def _calibrated_group(
 ) -> SelfCalibration:
     """Calibrate fluoroscopes in one adjustment, and exclude exposures that do not fit."""
     excluded: tuple[Finding, ...] = ()
+    if request.options.datum == 'inner':
+        frames, excluded = connected_frames(frames)
     for repeat in range(MAX_REPEATS):
         measured = measured_network(
             frames,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
+from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.network import MIN_RAYS
 from ..photogrammetry.precision import covariance_of_exteriors
@@ -33,6 +34,7 @@ from .initial_network import Measured
 from .options import CalibrationOptions
 from .rounds import SelfCalibration
 
+MIN_COMMON = 4  # targets that orient an exposure; three do so in several ways
 MIN_PAIRS = 2  # pairs of exposures that a constraint of the relative orientation needs
 
 
@@ -171,6 +173,53 @@ def _relative_constraints(
             )
         out.append(RelativeConstraint((0, b), pairs, sd_mm, sd_rad))
     return tuple(out)
+
+
+def connected_frames(frames: Frames) -> tuple[dict[str, list[Frame]], tuple[Finding, ...]]:
+    """Return the largest group of frames that common targets connect, and findings on the others.
+
+    A free network has no other relation between exposures. Targets with fewer than MIN_RAYS image
+    points connect none.
+    """
+    entries = [frame for exposures in frames.values() for frame in exposures]
+    ids, rays = np.unique(
+        np.concatenate([frame.target_id for frame in entries]), return_counts=True
+    )
+    remaining = [
+        (frame, frame.target_id[np.isin(frame.target_id, ids[rays >= MIN_RAYS])])
+        for frame in entries
+    ]
+    largest: list[Frame] = []
+    while len(remaining) > len(largest):
+        seed = max(remaining, key=lambda entry: len(entry[1]))
+        group, seen = [], seed[1]
+        while joining := [e for e in remaining if np.isin(e[1], seen).sum() >= MIN_COMMON]:
+            group += [frame for frame, _ in joining]
+            seen = np.unique(np.concatenate([seen, *(targets for _, targets in joining)]))
+            remaining = [entry for entry in remaining if not any(entry is e for e in joining)]
+        if not group:
+            break
+        largest = max(largest, group, key=len)
+    if not largest:
+        return {name: list(exposures) for name, exposures in frames.items()}, ()
+    kept = {id(frame) for frame in largest}
+    excluded = [
+        Finding(
+            Kind.FEW_TARGETS,
+            f'fewer than {MIN_COMMON} of its targets are seen in the other exposures, which '
+            'without surveyed coordinates does not orient it',
+            frame.place,
+            severity=Severity.NOTE,
+            numbers={'targets': len(frame.target_id), 'needed': MIN_COMMON},
+        )
+        for frame in entries
+        if id(frame) not in kept
+    ]
+    connected = {
+        name: [frame for frame in exposures if id(frame) in kept]
+        for name, exposures in frames.items()
+    }
+    return connected, tuple(excluded)
 
 
 def _without_targets_of_few_rays(measured: Measured) -> Measured:

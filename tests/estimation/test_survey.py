@@ -459,6 +459,30 @@ def test_poses_that_do_not_separate_the_unknowns_are_refused(monkeypatch, degree
         survey(SurveyRequest(frames, rough(rig)))
 
 
+def only(frame, targets):
+    """Return a frame with those of its targets that are given."""
+    kept = np.isin(frame.target_id, targets)
+    return replace(frame, target_id=frame.target_id[kept], uv=frame.uv[kept], sigma=None)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('alone', [1, 3])
+@pytest.mark.parametrize('common', [0, 2])
+def test_exposures_of_beads_of_their_own_do_not_spoil_a_free_network(alone, common):
+    """Nothing orients them relative to the others."""
+    rig = rigs.rig()
+    frames = rigs.exposures(8)['a']
+    own = np.unique(np.concatenate([f.target_id for f in frames]))[::2]
+    others = np.setdiff1d(rig.phantom.target_id, own[common:])
+    split = [only(f, own if row < alone else others) for row, f in enumerate(frames)]
+    options = CalibrationOptions(model='parametric', datum='inner')
+    result = calibrate({'a': split}, rig.phantom, options)
+    numbers = [exposure.exposure for exposure in result.fluoroscopes['a'].exposures]
+    assert numbers == [frame.number for frame in frames[alone:]]
+    excluded = [f for f in result.findings if f.kind is Kind.FEW_TARGETS]
+    assert [f.place.exposures for f in excluded] == [(f.number,) for f in frames[:alone]]
+
+
 @pytest.mark.long
 def test_a_bead_with_one_good_ray_does_not_spoil_the_datum_of_a_free_network():
     """Its place along the ray is open; this raised the sd of all others from 0.06 to 2 mm."""

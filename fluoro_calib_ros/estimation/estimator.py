@@ -83,19 +83,23 @@ def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:
 
 
 def gauge_basis(
-    uv: ArrayLike, interior: NDArray[np.float64], kind: GaugeKind = GaugeKind.FULL
+    uv: ArrayLike,
+    interior: NDArray[np.float64],
+    kind: GaugeKind = GaugeKind.FULL,
+    unit_px: float = UNIT_PX,
 ) -> NDArray[np.float64]:
-    """Return the basis (n, 2, g) of the gauge at pixels uv (n, 2), of magnitude about one.
+    """Return the basis (n, 2, g) of the gauge at pixels uv (n, 2).
 
-    interior: (3,) xp, yp, c [px]. g is 3 for the rotations (TURNS), 0 for NONE, else 6.
+    interior: (3,) xp, yp, c [px]. g is 3 for the rotations (TURNS), 0 for NONE, else 6. unit_px:
+    unit of the image coordinates; with half an image, the basis is about one.
     """
-    xy = (np.asarray(uv) - interior[:2]) / UNIT_PX
+    xy = (np.asarray(uv) - interior[:2]) / unit_px
     if kind is GaugeKind.NONE:
         return np.zeros((len(xy), 2, 0))
     if kind is not GaugeKind.TURNS:
         return orientation_fields(xy)
     x, y = xy.T
-    square = (UNIT_PX / interior[2]) ** 2
+    square = (unit_px / interior[2]) ** 2
     columns = [
         (-y, x),
         (1 + square * x * x, square * x * y),
@@ -134,10 +138,13 @@ def gauge_rows(
     The products vanish for a series without a gauge part. values (n, m): functions of the series
     at pixels uv (n, 2); interior (3,) [px]. The coefficients of u precede those of v.
     """
-    basis = gauge_basis(uv, interior, kind)
+    # Half the side of a square that the points fill evenly: a small image fixes the gauge as well.
+    square = np.mean(np.sum((uv - interior[:2]) ** 2, axis=1))
+    unit_px = float(np.sqrt(1.5 * square))
+    basis = gauge_basis(uv, interior, kind, unit_px)
     count = basis.shape[2]
     if kind is GaugeKind.TREND:
-        basis = np.concatenate([basis, _cubic_terms(uv, interior)], axis=2)
+        basis = np.concatenate([basis, _cubic_terms(uv, interior, unit_px)], axis=2)
         flat = basis.reshape(-1, basis.shape[2])
         solved = np.linalg.solve(flat.T @ flat, flat.T)[:count]
         basis = solved.T.reshape(len(uv), 2, count) * len(uv)
@@ -145,9 +152,11 @@ def gauge_rows(
     return np.concatenate(rows, axis=1) / len(uv)
 
 
-def _cubic_terms(uv: ArrayLike, interior: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cubic_terms(
+    uv: ArrayLike, interior: NDArray[np.float64], unit_px: float = UNIT_PX
+) -> NDArray[np.float64]:
     """Return terms (n, 2, 14) that complete the gauge to all cubic polynomials about (xp, yp)."""
-    x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
+    x, y = (np.asarray(uv) - interior[:2]).T / unit_px
     powers = np.stack([x**i * y**j for i, j in polynomial_powers(CUBIC)], axis=1)
     terms = [polynomial_coefficients(CUBIC, parts) for parts in cubic_terms().values()]
     return np.stack([powers @ term.T for term in terms], axis=2)

@@ -30,6 +30,7 @@ from fluoro_calib_ros.estimation.estimator import (
     exposure_folds,
     gauge_basis,
     gauge_coefficients,
+    gauge_rows,
     interior_about,
 )
 from fluoro_calib_ros.estimation.neighbour_regression import CrossValidation, NeighbourRegression
@@ -425,6 +426,18 @@ def chosen(kind='local_linear', gauge=GaugeKind.FULL, k=None):
     values[::30] += 500
     regressor.choose(values, q, np.tile(np.eye(2), (len(values), 1, 1)))
     return regressor, values
+
+
+@pytest.mark.parametrize('kind', [GaugeKind.FULL, GaugeKind.TREND, GaugeKind.TURNS])
+def test_the_gauge_is_fixed_in_small_images_as_in_large_ones(kind):
+    """A loose tilt of an image of 128 px had made the principal point five times less certain."""
+    rng = np.random.default_rng(7)
+    uv, values = rng.uniform(0, 1024, (300, 2)), rng.normal(size=(300, 12))
+    interior = np.array([480.0, 530, 4100])
+    rows = gauge_rows(values, uv, interior, kind)
+    for factor in (0.125, 4.0):
+        scaled = gauge_rows(values, factor * uv, factor * interior, kind)
+        np.testing.assert_allclose(scaled, rows, rtol=1e-6, atol=1e-9 * np.abs(rows).max())
 
 
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])

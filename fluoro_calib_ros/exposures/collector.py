@@ -92,6 +92,7 @@ class ExposureCollector:
         self.still = still or StillOptions()
         self.exposures: list[Pair] = []
         self.coverage: dict[str, Coverage] = {}
+        self._numbers: set[tuple[str, int]] = set()  # fluoroscopes and frame numbers of exposures
         self._recent: deque[Pair] = deque(maxlen=MAX_RECENT)
         self._streaming = False
         self._single: Pair | None = None  # collected as a single shot, but may begin a stream
@@ -139,10 +140,10 @@ class ExposureCollector:
 
     def _discard(self, pair: Pair) -> None:
         """Remove an exposure."""
-        self.exposures = [exposure for exposure in self.exposures if exposure is not pair]
-        self.coverage = {}
-        for exposure in self.exposures:
-            self._cover(exposure)
+        kept = [exposure for exposure in self.exposures if exposure is not pair]
+        self.exposures, self.coverage, self._numbers = [], {}, set()
+        for exposure in kept:
+            self.add(exposure)
 
     def _displacement(self, one: Pair, other: Pair) -> float:
         """Return the largest displacement [px] of all fluoroscopes between two pairs."""
@@ -165,24 +166,19 @@ class ExposureCollector:
 
         Returns '' if the pair was collected, otherwise the reason.
         """
-        numbers = {pair[name].number for name in self.fluoroscopes}
-        for exposure in self.exposures:
-            if any(exposure[name].number == pair[name].number for name in self.fluoroscopes):
-                return f'frame {min(numbers)} is collected already'
+        numbers = {(name, pair[name].number) for name in self.fluoroscopes}
+        if not numbers.isdisjoint(self._numbers):
+            return f'frame {min(number for _, number in numbers)} is collected already'
         self.exposures.append(pair)
-        self._cover(pair)
-        return ''
-
-    def _cover(self, pair: Pair) -> None:
-        """Add a pair to the coverage."""
+        self._numbers |= numbers
         for name in self.fluoroscopes:
             frame = pair[name]
             self.coverage.setdefault(name, Coverage(frame.image_size)).add(frame.uv)
+        return ''
 
     def reset(self) -> None:
         """Discard all exposures."""
-        self.exposures = []
-        self.coverage = {}
+        self.exposures, self.coverage, self._numbers = [], {}, set()
         self._recent.clear()
         self._streaming = False
         self._single = None

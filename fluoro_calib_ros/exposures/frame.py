@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..brief import brief_repr
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity, first_few
+from .names import MAX_ID
 from .phantom import Phantom, first_repeated, is_positive
 
 DECIMALS = 4  # decimals of a pixel, and of its standard deviation, in files
@@ -263,7 +264,7 @@ def cells_of(uv: ArrayLike, image_size: ArrayLike, count: int) -> NDArray[np.int
 class MovingPoints:
     """Coordinates of targets that differ between exposures, in the frame of the lab.
 
-    Raises DataError for a negative exposure or target id.
+    Raises DataError for a negative exposure or target id, and for ids that cannot be unique.
 
     Parameters
     ----------
@@ -287,6 +288,12 @@ class MovingPoints:
             if (numbers < 0).any():
                 raise DataError(f'moving points: {name} is {numbers.min()}, it must be 0 or above')
             object.__setattr__(self, name, numbers)
+        exposure = int(self.exposure.max(initial=0))
+        if (exposure + 1) * self.base > MAX_ID:
+            raise DataError(
+                f'moving points: the ids of exposure {exposure} exceed {MAX_ID}: number the '
+                'exposures from 1 on, or give the targets smaller ids'
+            )
 
     @property
     def base(self) -> int:

@@ -204,6 +204,10 @@ def test_what_does_not_go_together_is_refused():
     assert points.ids(7, 5) == 705
     with pytest.raises(DataError, match=r'exposure 1: the coordinates of target .* are not given'):
         points.as_phantom(frames)
+    # Ids of files and messages have 32 bits; those of exposure 1e9 exceeded even 64.
+    for exposure in (43_000_000, 10**9, 2**62):
+        with pytest.raises(DataError, match='number the exposures from 1 on'):
+            MovingPoints([1, exposure], [1, 12], np.eye(2, 3), np.ones(2))
 
 
 def test_the_command_takes_markers_in_motion(motion, tmp_path, capsys):

@@ -214,6 +214,28 @@ def test_add_requires_only_a_new_number():
     assert [e['b'].number for e in collector.exposures] == [1, 2]
 
 
+class CountedPair(dict):
+    """A pair that counts how often its frames are read."""
+
+    reads = 0
+
+    def __getitem__(self, name):
+        self.reads += 1
+        return super().__getitem__(name)
+
+
+def test_a_collected_pair_is_not_read_again_for_each_later_one():
+    """The time of a recording had grown with the square of its exposures."""
+    collector = ExposureCollector('ab')
+    first = CountedPair(pair(1))
+    assert not collector.add(first)
+    reads = first.reads
+    assert not any(collector.add(pair(number)) for number in range(2, 30))
+    assert first.reads == reads
+    collector.reset()
+    assert not collector.add(first)
+
+
 def test_pairs_without_a_stamp_are_collected_only_on_request():
     collector = ExposureCollector('ab')
     reasons = {collector.offer(pair(number, -1000, 50 * number)) for number in range(1, 5)}

@@ -19,6 +19,8 @@ MEGABYTE = 2**20
 
 # Bags [bytes].
 MAX_CHUNK = 512 * MEGABYTE  # of a chunk in a bag, uncompressed
+# Of a compressed file of a bag, unpacked over packed; image points have 2, images of a test 20.
+MAX_EXPANSION = 100
 MAX_OBSERVATIONS = 4 * MEGABYTE  # of a message in a bag: 150,000 image points
 MAX_TOPICS = 2000  # of a bag
 BYTES_OF_HEAD = 4096  # of a message of image points: header and names

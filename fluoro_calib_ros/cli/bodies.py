@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import DataError, ErrorsAt
 from ..findings import Severity
@@ -100,6 +100,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, 'exit_zero')
 
 
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
+    """Call error with a sentence for a neutral recording without joints."""
+    if arguments.neutral is not None and arguments.joints is None:
+        error('--neutral: there are no joints, give --joints')
+
+
 def run(arguments: argparse.Namespace) -> bool:
     """Track the bodies of a recording; write poses and joints. Raises DataError.
 
@@ -127,8 +133,6 @@ def run(arguments: argparse.Namespace) -> bool:
         raise DataError(f'{arguments.source}: {NO_TIMES if arguments.rate is None else TIMES}')
     neutral = None
     if arguments.neutral is not None:
-        if not joints:
-            raise DataError('--neutral: there are no joints, give --joints')
         neutral_arguments = argparse.Namespace(**{**vars(arguments), 'source': arguments.neutral})
         neutral = read_oriented_source(neutral_arguments)[0].frames
     options = options_of(

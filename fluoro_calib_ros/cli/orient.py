@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import argparse
 
-from ..errors import ErrorsAt
-from ..findings import Kind, sentences
+from ..errors import DataError, ErrorsAt
+from ..findings import Kind, first_few, sentences
 from .arguments import (
     add_bag_options,
     add_shared,
@@ -74,6 +74,13 @@ def run(arguments: argparse.Namespace) -> bool:
     survey, recording, calibrations = read_calibrated_exposures(arguments)
     frames = recording.frames
     if arguments.exposures is not None:
+        known = {frame.number for view_frames in frames.values() for frame in view_frames}
+        missing = sorted(arguments.exposures - known)
+        if missing:
+            raise DataError(
+                f'{arguments.source}: no fluoroscope has the exposures {first_few(missing)} of '
+                '--exposures'
+            )
         frames = {
             name: [frame for frame in view_frames if frame.number in arguments.exposures]
             for name, view_frames in frames.items()

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
-from ..errors import DataError
 from .arguments import number_in
 from .output import print_result
 
@@ -117,10 +116,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
-    """Call error with a sentence unless exactly one output file is given."""
+    """Call error with a sentence unless there are one output file and a picture of its own."""
     if (arguments.file is None) == (arguments.out is None):
         error('one file to write is needed: OUT.csv')
     arguments.out = arguments.out or arguments.file
+    arguments.picture = arguments.picture or arguments.out.with_suffix('.svg')
+    if arguments.picture.suffix.lower() not in PICTURES:
+        error(f'{arguments.picture}: a picture is {" or ".join(PICTURES)}')
+    if arguments.picture == arguments.out:
+        error(f'{arguments.picture}: picture and phantom file are the same file')
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -130,11 +134,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.phantom import write_phantom
     from ..report.figures import phantom_figure, picture_bytes
 
-    picture = arguments.picture or arguments.out.with_suffix('.svg')
-    if picture.suffix.lower() not in PICTURES:
-        raise DataError(f'{picture}: a picture is {" or ".join(PICTURES)}')
-    if picture == arguments.out:
-        raise DataError(f'{picture}: picture and phantom file are the same file')
+    picture = arguments.picture
     columns, rows, layers = (*(arguments.cube or arguments.square or arguments.hex), 1)[:3]
     drawing = Drawing(
         columns=columns,

@@ -44,6 +44,8 @@ PROMPT = '$ '  # before a command in the log
 POLL_S = 0.05  # interval between polls of the running commands
 SOURCE = 'source'
 OF_PROCESS = ('out', 'calibration', 'json', 'help', 'help_all', SOURCE)
+# Options of trials whose output is one for all of them: each trial would replace that of another.
+OF_ONE_TRIAL = ('learn', 'overlay')
 WRONG_DRIFT = ('warn', 'error')
 
 
@@ -245,6 +247,8 @@ def _step(
         name = key.replace('-', '_')
         if name in OF_PROCESS and (command, name) != ('calibrate', SOURCE):
             error(f'the key {key} is set by the study')
+        if name in OF_ONE_TRIAL:
+            error(f'each trial would replace what {key} writes: give --{key} to a single command')
         if name != SOURCE:
             all_words += _option_words(key, value, error)
     arguments = parse(all_words, error)

@@ -140,6 +140,19 @@ def encode(image: np.ndarray, suffix: str, quality: int = 95) -> bytes:
     return bytes(cv2.imencode(suffix, image, parameters)[1].tobytes())
 
 
+def encode_overlay(picture: np.ndarray) -> bytes:
+    """Return the bytes of a PNG file for a picture (h, w, 3) of results, marked as one."""
+    content = encode(picture, '.png')
+    text = b'tEXt' + OVERLAY_MARK
+    chunk = len(OVERLAY_MARK).to_bytes(4, 'big') + text + zlib.crc32(text).to_bytes(4, 'big')
+    return content[:END_OF_HEADER] + chunk + content[END_OF_HEADER:]
+
+
+def is_overlay(head: bytes) -> bool:
+    """Return whether the first END_OF_MARK bytes of a file are those of `encode_overlay`."""
+    return head.startswith(PNG_SIGNATURE) and OVERLAY_MARK in head
+
+
 def _check_png(content: memoryview) -> None:
     """Raise DataError unless all chunks of a PNG are present, with correct checksums."""
     position = len(PNG_SIGNATURE)
@@ -156,6 +169,9 @@ def _check_png(content: memoryview) -> None:
         kind = bytes(chunk[:4])
 
 
+OVERLAY_MARK = b'Software\0overlay of fluoro_calib_ros'
+END_OF_HEADER = 33  # of a PNG: signature and the chunk IHDR [bytes]
+END_OF_MARK = END_OF_HEADER + 8 + len(OVERLAY_MARK)
 PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 TIFF_SIGNATURES = (b'II*\0', b'MM\0*', b'II+\0', b'MM\0+')
 # Headers of a JPEG frame: SOF0 to SOF15 without DHT, JPG and DAC.

@@ -208,11 +208,11 @@ def numbers_of(
     """
     if key not in table:
         raise DataError(f'{where}: there is no {key}')
-    are_numbers = _are_numbers(table[key])
-    if not are_numbers and not shape:
+    is_numeric = are_numbers(table[key])
+    if not is_numeric and not shape:
         raise DataError(f'{where}: {key} does not consist of numbers')
     try:
-        array = np.array(table[key] if are_numbers else None, dtype=float)
+        array = np.array(table[key] if is_numeric else None, dtype=float)
     except ValueError:  # rows of different lengths
         array = np.array(np.nan)
     if shape is not None and array.shape != shape:
@@ -222,9 +222,10 @@ def numbers_of(
     return array
 
 
-def _are_numbers(value: Any) -> bool:
+def are_numbers(value: Any) -> bool:
+    """Return whether an entry of a document is a number, or lists of numbers; no text is one."""
     if isinstance(value, list):
-        return all(map(_are_numbers, value))
+        return all(map(are_numbers, value))
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..brief import brief_repr
@@ -18,6 +17,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
+from ..images.codec import encode_overlay
 from ..images.extraction import BENT_LEFT
 from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.overlay import small_jpeg
@@ -165,7 +165,7 @@ def _result(
         )
     png: bytes | None = None
     if observations.picture is not None:
-        png = cv2.imencode('.png', observations.picture)[1].tobytes()
+        png = encode_overlay(observations.picture)
     values = {**vars(observations), 'picture': None}
     return ImageResult(
         **values, exposure=source.exposure, place=source.place, frame=frame, png=png

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,6 +18,7 @@ import numpy as np
 from ..errors import DataError
 from ..exposures.angles import AngleOptions, JointAngles
 from ..exposures.stamps import NS_PER_S, ExposureNumbers
+from ..images.codec import END_OF_MARK, is_overlay
 from ..io.bags.mcap_file import METADATA, is_bag
 from ..io.bags.metadata import TARGET_OBSERVATIONS
 from ..io.bags.reader import angles_in, image_topics, images_of, topics_of
@@ -157,9 +159,20 @@ def fluoroscope_folders(source: Path) -> dict[str, Path]:
     return {
         path.name: path
         for path in sorted(source.iterdir())
-        if path.is_dir()
-        and any(image_suffix_of(file) in EXPOSURE_SUFFIXES for file in path.iterdir())
+        if path.is_dir() and any(map(_is_exposure, path.iterdir()))
     }
+
+
+def _is_exposure(path: Path) -> bool:
+    """Return whether a file is a radiograph by its suffix, and no picture of our results."""
+    if image_suffix_of(path) not in EXPOSURE_SUFFIXES:
+        return False
+    try:
+        with path.open('rb') if path.is_file() else io.BytesIO() as file:
+            head = file.read(END_OF_MARK)
+    except OSError:  # the image reader reports the reason
+        head = b''
+    return not is_overlay(head)
 
 
 def dose_texts(source: Path) -> dict[str, str]:
@@ -199,10 +212,9 @@ def _dose(path: Path, changed_ns: int) -> tuple[float | None, float | None]:
 
 def contains_images(source: Path) -> bool:
     """Return whether a source is an image, a folder of images, a video, or a bag of images."""
-    if source.is_dir() and not (source / METADATA).exists():
-        has_images = any(image_suffix_of(path) in EXPOSURE_SUFFIXES for path in source.iterdir())
-        if has_images or fluoroscope_folders(source):
-            return True
+    is_folder = source.is_dir() and not (source / METADATA).exists()
+    if is_folder and (any(map(_is_exposure, source.iterdir())) or fluoroscope_folders(source)):
+        return True
     if not is_bag(source):
         return not source.is_dir() and bool(image_suffix_of(source))
     try:
@@ -214,7 +226,7 @@ def contains_images(source: Path) -> bool:
 
 def _images_in(folder: Path) -> list[Path]:
     """Return the images of a folder, ordered by number and name. Raises DataError if none."""
-    images = [path for path in folder.iterdir() if image_suffix_of(path) in EXPOSURE_SUFFIXES]
+    images = [path for path in folder.iterdir() if _is_exposure(path)]
     if not images:
         raise DataError(
             f'{folder}: there are no images in this folder ({listed(EXPOSURE_SUFFIXES)})'

@@ -16,7 +16,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +27,7 @@ from ..exposures.decisions import Doubtful
 from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding
+from ..images.codec import encode_overlay
 from ..images.marker_decisions import Decision, EarlierImages
 from ..images.marker_ids import identifiable, identify_markers
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
@@ -474,4 +474,4 @@ def _write_pictures(
                     image.image, markers_by_exposure[image.exposure], request.target_names
                 )
                 path = request.overlay / f'{name}_{image.exposure:04d}.png'
-                write_bytes(path, cv2.imencode('.png', picture)[1].tobytes())
+                write_bytes(path, encode_overlay(picture))

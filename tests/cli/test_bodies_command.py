@@ -129,7 +129,7 @@ def test_neutral_position_of_another_recording(knee, tmp_path, capsys):
     )
     assert angles == pytest.approx(of_key, abs=1e-9) and abs(angles.mean()) < 1
     capsys.readouterr()
-    assert bodies(knee, tmp_path / 'none', '--neutral', knee / 'walking') == 1
+    assert bodies(knee, tmp_path / 'none', '--neutral', knee / 'walking') == 2
     assert 'give --joints' in capsys.readouterr().err
 
 

@@ -11,6 +11,7 @@ import json
 import os
 import pathlib
 import re
+import shutil
 import subprocess
 import sys
 
@@ -771,6 +772,14 @@ def test_angles_of_images_are_not_ignored_for_image_points(result, tmp_path, cap
     assert run(*words, '--angles', tmp_path / 'angles.csv') == 1
     assert 'a column angle_deg' in capsys.readouterr().err
     assert not (tmp_path / 'corrected.csv').exists()
+
+
+def test_orient_names_exposures_that_are_not_in_the_capture(rig, result, tmp_path, capsys):
+    folder = shutil.copytree(result, tmp_path / 'result')
+    words = ('orient', rig / 'calibration', '--phantom', rig / 'phantom.csv')
+    capsys.readouterr()
+    assert run(*words, '--calibration', folder, '--exposures', '1,98-99') == 1
+    assert 'no fluoroscope has the exposures 98, 99' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('command', ['adjust', 'orient', 'bodies', 'heal'])

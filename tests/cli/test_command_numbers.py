@@ -109,7 +109,7 @@ def test_places_and_pitches_of_a_drawing():
     for text, parse in (('3', phantom.place), ('3,x', phantom.place), ('1,2', phantom.pitches)):
         with pytest.raises(argparse.ArgumentTypeError):
             parse(text)
-    given = Fake(file=None, out=Path('x'))
+    given = Fake(file=None, out=Path('x'), picture=None)
     phantom.check(given, wrong)
     assert given.out == Path('x')
     for both in (Fake(file=None, out=None), Fake(file=Path('x'), out=Path('y'))):
@@ -652,7 +652,7 @@ def test_phantom_is_written_with_its_picture(tmp_path, capsys, words, full, bloc
     assert read_phantom(out).target_id.tolist() == sorted({*range(1, full + 1)} - {*blocked})
     for wrong_picture in ('p.gif', 'p.svg'):
         path = tmp_path / wrong_picture
-        assert run(*command, '--out', tmp_path / 'p.svg', '--picture', path) == 1
+        assert run(*command, '--out', tmp_path / 'p.svg', '--picture', path) == 2
         assert str(path) in capsys.readouterr().err
 
 

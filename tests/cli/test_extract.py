@@ -28,7 +28,12 @@ from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.observations import read_observations_csv
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs.extraction import recording_of_images
-from fluoro_calib_ros.jobs.image_sources import ImageAngles, contains_images, open_sources
+from fluoro_calib_ros.jobs.image_sources import (
+    ImageAngles,
+    contains_images,
+    fluoroscope_folders,
+    open_sources,
+)
 from fluoro_calib_ros.jobs.sources import read_survey
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 
@@ -146,6 +151,8 @@ def test_a_folder_becomes_a_table_that_calibrate_reads(folder, capsys):
         'a_0001.png',
         'a_0003.png',
     ]
+    # Pictures of results are no radiographs, wherever they are.
+    assert list(fluoroscope_folders(folder)) == ['a'] and not contains_images(folder / 'overlay')
 
 
 def test_a_stack_is_numbered_by_its_order(folder):

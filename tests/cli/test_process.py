@@ -281,6 +281,8 @@ def test_wrong_study_is_named_with_its_key(tmp_path, text, words):
         ('[reconstruct]\nhelp-all = true\n', ['table reconstruct', 'help-all', 'set by']),
         ('[reconstruct]\nhelp_all = true\n', ['table reconstruct', 'help_all', 'set by']),
         ('[reconstruct]\nreject = {a = 1}\n', ['table reconstruct', 'reject']),
+        ('[bodies]\nbodies = "b"\nlearn = true\n', ['table bodies', 'learn', 'single command']),
+        ('[extract]\noverlay = "o"\n', ['table extract', 'overlay', 'single command']),
         ('[bodies]\njoints = "j"\n', ['table bodies', '--bodies']),
     ],
 )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from rigs import exposures, run
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
@@ -21,6 +22,7 @@ from fluoro_calib_ros.io.bags.metadata import (
 from fluoro_calib_ros.io.bags.reader import read_frames, topics_of
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.jobs.sources import BagSelection, read_source
+from fluoro_calib_ros.limits import ReadLimits, use_read_limits
 
 SECOND = 10**9
 
@@ -62,6 +64,26 @@ def test_other_storages_are_read(tmp_path, frames, storage, mode):
             path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(DataError, match='bag'):
         read_frames(tmp_path / 'bag')
+
+
+def test_a_bag_that_unpacks_to_far_more_than_its_size_is_refused(tmp_path, frames):
+    bag = Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP)
+    bag.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with bag:
+        topic = '/a/target_observations'
+        connection = bag.add_connection(topic, TARGET_OBSERVATIONS, typestore=typestore())
+        for frame in frames['a']:
+            data = to_cdr(message_from_frame(frame), TARGET_OBSERVATIONS)
+            bag.write(connection, frame.stamp_ns, data)
+    (packed,) = (tmp_path / 'bag').glob('*.zstd')
+    with open(packed, 'ab') as file:  # a further frame of zeros, as a decompressor joins them
+        file.write(zstandard.ZstdCompressor().compress(bytes(40_000_000)))
+    use_read_limits(ReadLimits(max_file_mb=1))
+    try:
+        with pytest.raises(DataError, match='unpacked, it has more'):
+            read_frames(tmp_path / 'bag')
+    finally:
+        use_read_limits(ReadLimits())
 
 
 def test_numbers_that_begin_again_become_different(tmp_path, frames):

@@ -62,6 +62,9 @@ WRONG = {
     'unknown key': (FILE + '    c: 3\n', "'c' is unknown, an entry has K, R, t_mm"),
     'no t': (FILE.replace('    t_mm: [0, 0, 1500]\n', ''), 'fluoroscope a: t_mm is missing'),
     'text': (FILE.replace('1500', 'far'), 'a value is not a number'),
+    'number as text': (FILE.replace('1500', '"1500"'), 'a value is not a number'),
+    'sd as text': (FILE + '    exterior_sd: ["0.1", 1]\n', 'a value is not a number'),
+    'K with a truth value': (FILE.replace('0, 0, 1]]', '0, 0, yes]]'), 'a value is not a number'),
     'NaN': (FILE.replace('1500', '.nan'), 'position_mm is not'),
     'ragged': (FILE.replace('[0, 0, 1]]', '[0, 1]]'), 'a value is not a number'),
     'transposed K': (

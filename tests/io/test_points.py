@@ -1277,6 +1277,8 @@ def test_names_that_begin_with_a_mark_return(tmp_path, kind):
         ('xmalab3d', 'a,b', 'a comma'),
         ('xmalab3d', 'a\nb', 'a line end'),
         ('trc', 'a\tb', 'a tabulator'),
+        ('deeplabcut', 'a\rb', 'a line end'),
+        ('deeplabcut', '\na', 'a line end'),
     ],
 )
 def test_names_that_would_be_two_cells_are_not_written(tmp_path, kind, name, cause):
@@ -1289,7 +1291,7 @@ def test_names_that_would_be_two_cells_are_not_written(tmp_path, kind, name, cau
     )
     with pytest.raises(DataError, match=cause):
         registry.write(tmp_path / 'out', kind, content, SETTINGS)
-    assert not (tmp_path / 'out').exists()
+    assert not [path for path in tmp_path.rglob('*') if path.is_file()]
 
 
 POSE_ROWS = (

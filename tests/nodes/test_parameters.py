@@ -123,6 +123,8 @@ class Options:
     def __post_init__(self) -> None:
         if self.count == 13:
             raise ValueError('count: 13 brings bad luck')
+        if self.length_m > 9:
+            raise ValueError(f'length_m must not exceed count, but is {self.length_m:g}')
 
 
 GROUP = ParameterGroup(
@@ -166,6 +168,7 @@ def test_a_group_becomes_an_options_object(make_node):
         ({'count': 1.5}, 'parameter count must be an integer, not 1.5'),
         ({'names': 'x'}, r"parameter names must be a list of strings, such as \[a, b\], not 'x'"),
         ({'count': 13}, 'parameter count: 13 brings bad luck'),
+        ({'length': 9.5}, 'parameter length must not exceed count, but is 9.5'),
         ({'kind': 'c'}, "parameter kind must be one of a, b, not 'c'"),
     ],
 )

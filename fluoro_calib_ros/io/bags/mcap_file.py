@@ -27,7 +27,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 
 from ...errors import DataError, ErrorsAt
-from ...limits import MAX_CHUNK, MAX_TOPICS
+from ...limits import MAX_CHUNK, MAX_EXPANSION, MAX_TOPICS, MEGABYTE, read_limits
 from ..access import PathLike, check_regular_file, os_errors
 from ..documents import read_yaml
 from .metadata import Definition, parse_profiles, to_yaml
@@ -452,6 +452,21 @@ def messages_of_bag(source: PathLike, topics: Collection[str] | None) -> Iterato
                 yield BagMessage(connection.topic, connection.msgtype, time_ns, bytes(data))
 
 
+def _check_unpacked_size(path: str) -> None:
+    """Raise DataError for a file that the library would unpack to far more than a bag has."""
+    limit = max(read_limits().max_file_bytes, MAX_EXPANSION * os.path.getsize(path))
+    unpacked = 0
+    with open(path, 'rb') as file, suppress(zstandard.ZstdError):  # the library reports damage
+        stream = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
+        while unpacked <= limit and (block := stream.read(MEGABYTE)):
+            unpacked += len(block)
+    if unpacked > limit:
+        raise DataError(
+            f'{path}: unpacked, it has more than {limit / 1e6:.0f} MB, {MAX_EXPANSION} times its '
+            'size; give a larger max_file_mb if it is a bag'
+        )
+
+
 @contextmanager
 def _opened(source: PathLike) -> Iterator[Reader]:
     """Open a bag; turn every error of the library into a DataError."""
@@ -459,7 +474,10 @@ def _opened(source: PathLike) -> Iterator[Reader]:
 
     check_regular_file(source)
     for name in os.listdir(source) if os.path.isdir(source) else ():
-        check_regular_file(os.path.join(source, name))
+        path = os.path.join(source, name)
+        check_regular_file(path)
+        if name.endswith('.zstd'):
+            _check_unpacked_size(path)
     try:
         with Reader(Path(source)) as bag:
             yield bag

@@ -353,6 +353,7 @@ def write_deeplabcut(path: Path, content: Content, settings: FileSettings) -> Wr
 def _write_camera(path: Path, frames: Sequence[Frame], named: dict[int, str]) -> None:
     ids = _ids(frames)
     names = [as_text(named.get(i, default_name(i))) for i in ids]
+    check_labels(path, names, '')
     with atomic_file(path, 'w') as file:
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(['scorer'] + [SCORER] * 3 * len(ids))

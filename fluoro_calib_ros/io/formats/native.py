@@ -27,7 +27,7 @@ from ..access import PathLike, read_text, write_text
 from ..bodies import NAME_COLUMN
 from ..bodies import POINT_COLUMNS as POINTS
 from ..csv_table import Table, has_columns, read_all
-from ..documents import read_yaml
+from ..documents import are_numbers, read_yaml
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
@@ -279,6 +279,8 @@ def _orientation(entry: Any, where: str) -> KnownOrientation:
         if key not in entry:
             raise DataError(f'{where}: {key} is missing')
     try:
+        if not all(are_numbers(entry[key]) for key in KEYS if entry.get(key) is not None):
+            raise TypeError
         k, r, t = (np.array(entry[key], dtype=float) for key in KEYS[:3])
         return KnownOrientation.from_matrices(
             k, r, t, entry.get('interior_sd_px'), entry.get('exterior_sd')

@@ -217,7 +217,14 @@ class ParameterGroup(Generic[T]):
         values = {name: _tuple_or_value(declarations[name], values[name]) for name in declarations}
         for name, declaration in declarations.items():
             declaration.validate(values[name])
-        return self.options(**{name: values[parameter] for name, parameter in self._names.items()})
+        try:
+            return self.options(
+                **{name: values[parameter] for name, parameter in self._names.items()}
+            )
+        except ValueError as error:
+            names = self._names
+            words = re.split(r'(\w+)', str(error))
+            raise ValueError(''.join(names.get(word, word) for word in words)) from None
 
 
 def group(

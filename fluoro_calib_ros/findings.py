@@ -97,7 +97,9 @@ class Kind(str, Enum):
     CORRECTED_ALREADY = 'corrected_already'
     POOR_CALIBRATION_FIT = 'poor_calibration_fit'
 
-    # Frames that are paired by stamp.
+    # Pairing of frames by number or by stamp.
+    FRAMES_UNNUMBERED = 'frames_unnumbered'
+    STAMPS_APART = 'stamps_apart'
     WIDE_TOLERANCE = 'wide_tolerance'
 
     # Orientation of the rig.

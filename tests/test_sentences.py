@@ -50,7 +50,7 @@ from fluoro_calib_ros.estimation.start_orientation import UNTILTED
 from fluoro_calib_ros.exposures.collector import without_repeats
 from fluoro_calib_ros.exposures.frame import without_strays
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.exposures.stamps import StampTolerance
+from fluoro_calib_ros.exposures.stamps import StampAgreement, StampTolerance
 from fluoro_calib_ros.findings import Finding, Kind, Place, too_few
 from fluoro_calib_ros.healing.diagnosis import Cause, Change
 from fluoro_calib_ros.images import detection, extraction, lattice, matching
@@ -217,6 +217,23 @@ def moved_rig():
     present = orientation()
     shifted = present.position_mm + np.array([[0.0, 0, 0], [20.0, 0, 0]])
     return orienting._change(present, replace(present, position_mm=shifted))
+
+
+def disagreement(numbers):
+    """Return the finding on stamps of ten exposures of a and b; numbers: theirs by exposure."""
+    streams = {
+        name: [
+            replace(frames()[0], fluoroscope=name, number=numbers(row)[side], stamp_ns=10**7 * row)
+            for row in range(1, 11)
+        ]
+        for side, name in enumerate('ab')
+    }
+    agreement = StampAgreement(('a', 'b'))
+    by_number = {frame.number: frame for frame in streams['b']}
+    for row, frame in enumerate(streams['a']):
+        partner = by_number.get(frame.number) if numbers(1) != (7, 7) else streams['b'][row]
+        agreement.add({'a': frame, 'b': partner} if partner else {'a': frame})
+    return agreement.disagreement()
 
 
 def trial(kind):
@@ -448,6 +465,8 @@ MAKERS = {
     Kind.WEAK_INTERSECTION: weak_intersection,
     Kind.DUPLICATE_NAME: lambda: raised(inputs.validate_names, ('a', 'A')),
     Kind.FRAMES_SHIFTED: lambda: trial(Kind.FRAMES_SHIFTED),
+    Kind.FRAMES_UNNUMBERED: lambda: disagreement(lambda number: (7, 7)),
+    Kind.STAMPS_APART: lambda: disagreement(lambda number: (number, number + 1)),
     Kind.FRAME_LOST: lambda: lost_frames_finding([LostFrames('b', 12, 1)]),
     Kind.FRAMES_DELAYED: lambda: delay_finding(('a', 'b'), Delay(-0.25, 0.01, 1.0), 0.01),
     Kind.IDS_REVERSED: lambda: inputs.CONFUSIONS[2][0],
@@ -700,6 +719,15 @@ SENTENCES = {
     ),
     Kind.FRAMES_SHIFTED: (
         '# % of the rays miss each other: the frame numbers of fluoroscope b are too small by #'
+    ),
+    Kind.FRAMES_UNNUMBERED: (
+        'frames of a are not numbered: # in a row have the number #, but different stamps: pair '
+        'frames by stamp'
+    ),
+    Kind.STAMPS_APART: (
+        'frames of a and b with the same number are # ms apart (# frame intervals): they belong '
+        'to different exposures, or the clocks of the cameras differ: start the cameras together, '
+        'or pair frames by stamp'
     ),
     Kind.FRAME_LOST: (
         'fluoroscope b has lost a frame before exposure #: add # to the numbers of its frames '

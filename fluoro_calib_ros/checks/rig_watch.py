@@ -275,7 +275,7 @@ class RigEvidence:
     ----------
     drift : DriftVerdict or None
         None if the drift watch is switched off.
-    disagreement : str
+    disagreement : Finding or None
         Set if frames that were paired by number are far apart in time.
     widening : float
         Factor of the limit of false matches at the end; above 1 if the rays miss each other by
@@ -287,7 +287,7 @@ class RigEvidence:
     """
 
     drift: DriftVerdict | None = None
-    disagreement: str = ''
+    disagreement: Finding | None = None
     widening: float = 1.0
     noise: Finding | None = None
     timing: Finding | None = None

@@ -108,14 +108,10 @@ def print_rig_evidence(source: Path, evidence: RigEvidence, reject: float) -> No
 
     reject: limit of false matches [standard deviations].
     """
-    if evidence.disagreement:
-        print_note(f'{source}: {evidence.disagreement}')
-    if evidence.drift is not None and evidence.drift.widening is not None:
-        print_note(f'{source}: {evidence.drift.widening.sentence}')
-    if evidence.noise is not None:
-        print_note(f'{source}: {evidence.noise.sentence}')
-    if evidence.timing is not None:
-        print_note(f'{source}: {evidence.timing.sentence}')
+    widening = None if evidence.drift is None else evidence.drift.widening
+    for finding in (evidence.disagreement, widening, evidence.noise, evidence.timing):
+        if finding is not None:
+            print_note(f'{source}: {finding.sentence}')
     if evidence.widening > 1:
         advice = (
             '; check the sigma of the image points, whether they count from 1, how many are '

@@ -398,8 +398,8 @@ def trial_row(
     """Return the row of a trial in the table; calibration: verdict on the calibration.
 
     The verdict is 'refused' if a command failed, 'fail' if the trial contradicts its calibration
-    or its bodies, and 'cannot tell' instead of pass if targets or bodies are doubtful; otherwise
-    that of the calibration.
+    or its bodies, and 'cannot tell' instead of pass if targets, bodies or stamps are doubtful;
+    otherwise that of the calibration.
     """
     row: dict[str, Any] = {'trial': name, 'verdict': calibration, 'cause': ''}
     for step, done in steps:
@@ -421,12 +421,12 @@ def _reconstruction_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -
         'points': document['points'],
         'points_ok': document['status']['OK'],
     }
-    cells |= _rig_cells(document)
+    cells |= _rig_cells(row, document)
     return cells | _doubts({**row, **cells}, document['lost_targets'])
 
 
-def _rig_cells(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the cells on what the rays of a trial say about its rig."""
+def _rig_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the cells on what rays and stamps of a trial say about its rig."""
     drift = document.get('drift') or {}
     widening = document.get('widening', 1.0)
     cells = {'widening': widening, 'drift': drift.get('kind', '')}
@@ -436,7 +436,8 @@ def _rig_cells(document: Mapping[str, Any]) -> dict[str, Any]:
     if timing is not None or widening > 1:
         cause = 'the rays miss each other by more than their standard deviations allow'
         return cells | {'verdict': 'fail', 'cause': timing['sentence'] if timing else cause}
-    return cells
+    disagreement = document.get('disagreement')
+    return cells | _doubts(row, [disagreement] if disagreement else [])
 
 
 def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
@@ -447,16 +448,16 @@ def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[s
     for joint, angles in document['joints'].items():
         for name, angle in angles.items():
             cells |= {f'{joint}_{name}_{key}': angle[key] for key in ('range_deg', 'sd_deg')}
-    cells |= _rig_cells(document)
+    cells |= _rig_cells(row, document)
     return cells | _doubts({**row, **cells}, document['findings'])
 
 
 def _doubts(row: Mapping[str, Any], findings: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return verdict and cause of a trial that would pass without these findings."""
+    """Return verdict and cause of a trial that would have a better one without these findings."""
     doubtful = [finding for finding in findings if finding['severity'] != 'note']
-    if not doubtful or row['verdict'] != 'pass':
-        return {}
     is_wrong = any(finding['severity'] == 'error' for finding in doubtful)
+    if not doubtful or row['verdict'] not in ('pass', 'cannot tell' if is_wrong else 'pass'):
+        return {}
     return {
         'verdict': 'fail' if is_wrong else 'cannot tell',
         'cause': '; '.join(finding['sentence'] for finding in doubtful),

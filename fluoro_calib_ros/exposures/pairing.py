@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, Protocol
 
+from ..findings import Finding
 from ..options import option, validate_options
 from .stamps import (
     RESTART_NS,
@@ -131,13 +132,13 @@ def recorded_exposures(
     yield from pairer.flush()
 
 
-def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> str:
-    """Return a sentence if recorded frames with the same number are far apart in time.
+def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> Finding | None:
+    """Return a warning if recorded frames with the same number are far apart in time.
 
-    frames: by fluoroscope. Returns '' if they agree; see StampAgreement.
+    frames: by fluoroscope. Returns None if they agree; see StampAgreement.
     """
     if len(frames) < MIN_VIEWS:
-        return ''
+        return None
     pairer = CompletePairer(frames, RecordedPairing().unlimited())
     pairer.stamps = StampAgreement(pairer.fluoroscopes, recent=None)
     deque(recorded_exposures(pairer, frames.values()), maxlen=0)

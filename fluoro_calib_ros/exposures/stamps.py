@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..findings import Finding, Kind, Severity
+from ..findings import Finding, Kind, Place, Severity
 
 NS_PER_S = 1_000_000_000
 # A stamp earlier than the latest one by more than this starts a new stream; else it is late.
@@ -104,39 +104,49 @@ class StampAgreement:
         if len(stamps) > 1:
             self._recent.append((frames[0].number, stamps))
 
-    def disagreement(self) -> str:
-        """Return a sentence if the frames of an exposure are far apart in time, otherwise ''.
+    def disagreement(self) -> Finding | None:
+        """Return a warning if the frames of an exposure are far apart in time, else None.
 
-        A constant offset between the clocks has the same effect; the sentence says so. Another
-        sentence says that frames are not numbered.
+        A constant offset between the clocks has the same effect; the advice says so. Another
+        warning is that frames are not numbered.
         """
         first, *others = self._fluoroscopes
-        return next(filter(None, (self._compare(first, other) for other in others)), '')
+        return next(filter(None, (self._compare(first, other) for other in others)), None)
 
-    def _compare(self, one: str, other: str) -> str:
+    def _compare(self, one: str, other: str) -> Finding | None:
         rows = [
             (number, stamps[one], stamps[other])
             for number, stamps in list(self._recent)
             if one in stamps and other in stamps
         ]
         if len(rows) < MIN_EXPOSURES:
-            return ''
+            return None
         number, first, second = np.array(rows, dtype=np.int64).T
         if not np.ptp(number) and np.ptp(first):
-            return (
+            return Finding(
+                Kind.FRAMES_UNNUMBERED,
                 f'frames of {one} are not numbered: {len(rows)} in a row have the number '
-                f'{number[0]}, but different stamps; pair frames by stamp'
+                f'{number[0]}, but different stamps',
+                Place((one,), name=''),
+                'pair frames by stamp',
+                Severity.WARNING,
+                numbers={'number': float(number[0]), 'frames': len(rows)},
             )
         interval = _frame_interval(number, first)
         offset = (second - first).astype(float)
         typical = float(np.median(np.abs(offset)))
         if not interval or typical <= MAX_PART * interval:
-            return ''
+            return None
         count = typical / interval
-        return (
+        return Finding(
+            Kind.STAMPS_APART,
             f'frames of {one} and {other} with the same number are {typical * 1e-6:.1f} ms apart '
             f'({count:.1f} frame intervals): they belong to different exposures, or the clocks '
-            'of the cameras differ; start the cameras together, or pair frames by stamp'
+            'of the cameras differ',
+            Place((one, other), name=''),
+            'start the cameras together, or pair frames by stamp',
+            Severity.WARNING,
+            numbers={'apart_ms': typical * 1e-6, 'frames': count},
         )
 
 

@@ -226,10 +226,17 @@ def orientation_document(orientation: RigOrientation) -> dict[str, Any]:
 
 def rig_document(evidence: RigEvidence, begin_ns: int) -> dict[str, Any]:
     """Return what rays say about a rig as a dict; begin_ns: stamp of the first exposure."""
+    found = {
+        name: None if finding is None else finding_document(finding)
+        for name, finding in (
+            ('noise', evidence.noise),
+            ('disagreement', evidence.disagreement),
+            ('timing', evidence.timing),
+        )
+    }
     return {
-        'noise': None if evidence.noise is None else finding_document(evidence.noise),
+        **found,
         'widening': evidence.widening,
-        'timing': None if evidence.timing is None else finding_document(evidence.timing),
         'drift': drift_document(evidence.drift, begin_ns),
     }
 

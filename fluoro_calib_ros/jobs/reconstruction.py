@@ -172,7 +172,7 @@ def reconstructed_rays(
     finding = why_rays_miss(recording, reconstructed, scatter.factor, timing)
     if finding is not None:
         raise DataError(finding)
-    disagreement = ''
+    disagreement = None
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
     drift = watch.verdict() if watch else drift

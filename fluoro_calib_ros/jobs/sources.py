@@ -264,7 +264,7 @@ def read_source(
     notes = content.notes
     if selection.pair_by == 'frame_number':
         disagreement = disagreement_of_recording(frames)
-        notes = (*notes, f'{path}: {disagreement}') if disagreement else notes
+        notes = (*notes, disagreement.at(path).sentence) if disagreement else notes
     collected = collect_recorded(
         frames, collect or 'all', selection.pair_by, tolerance_s=selection.tolerance_s
     )

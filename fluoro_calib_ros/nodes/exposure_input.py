@@ -172,8 +172,8 @@ class ExposureInput:
         Frames with the same number are far apart in time, or stamps fit two exposures.
         """
         with self._lock:
-            finding = self._pairer.tolerance.finding()
-            return finding.sentence if finding else self._pairer.stamps.disagreement()
+            finding = self._pairer.tolerance.finding() or self._pairer.stamps.disagreement()
+            return finding.sentence if finding else ''
 
     def next_pairs(self, count: int = 1, collected: bool = False) -> PairWait:
         """Wait for the next pairs; collected: only for those that it adds to the exposures."""

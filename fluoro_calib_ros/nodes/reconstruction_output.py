@@ -197,9 +197,8 @@ def _missing_publishers(state: ReconstructionState) -> str:
 
 def _missed_rays(state: ReconstructionState) -> str:
     """Return a message if the rays of the views do not intersect."""
-    finding = state.misses
-    disagreement = state.pairer.stamps.disagreement()
-    return '; '.join(filter(None, (finding.sentence, disagreement))) if finding else ''
+    found = (state.misses, state.pairer.stamps.disagreement()) if state.misses else ()
+    return '; '.join(finding.sentence for finding in found if finding is not None)
 
 
 def _silent_fluoroscopes(state: ReconstructionState) -> str:
@@ -212,8 +211,8 @@ def _silent_fluoroscopes(state: ReconstructionState) -> str:
 
 def _distant_stamps(state: ReconstructionState) -> str:
     """Return a message if frames of a number are far apart, or stamps fit two exposures."""
-    finding = state.pairer.tolerance.finding()
-    return finding.sentence if finding else state.pairer.stamps.disagreement()
+    finding = state.pairer.tolerance.finding() or state.pairer.stamps.disagreement()
+    return finding.sentence if finding else ''
 
 
 STREAM_CONDITIONS = (

@@ -422,7 +422,7 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
     made = Fake(
         frames=[],
         unpaired={},
-        disagreement='',
+        disagreement=None,
         widening=widening,
         drift=Fake(widening=None),
         lost_targets=[],

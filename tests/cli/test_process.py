@@ -337,6 +337,14 @@ def test_a_trial_with_a_delayed_fluoroscope_fails_with_that_cause():
     document['widening'] = 1.0
     row = trial_row('walk', 'pass', [(step, Done(0, document))])
     assert row['verdict'] == 'fail' and row['cause'] == 'b is late'
+    # Stamps that are far apart do not tell whether the clocks or the exposures differ.
+    document |= {'timing': None, 'disagreement': {'sentence': 'apart', 'severity': 'warning'}}
+    row = trial_row('walk', 'pass', [(step, Done(0, document))])
+    assert row['verdict'] == 'cannot tell' and row['cause'] == 'apart'
+    bodies = SimpleNamespace(command='bodies')
+    wrong = {'bodies': {}, 'joints': {}, 'findings': [{'sentence': 'no', 'severity': 'error'}]}
+    row = trial_row('walk', 'pass', [(step, Done(0, document)), (bodies, Done(3, wrong))])
+    assert row['verdict'] == 'fail' and row['cause'] == 'no'
 
 
 def test_step_is_kept_only_with_its_digest_and_all_that_it_wrote(tmp_path):

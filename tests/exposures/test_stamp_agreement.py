@@ -15,6 +15,7 @@ from fluoro_calib_ros.exposures.pairing import (
     exposure_pairer,
 )
 from fluoro_calib_ros.exposures.stamps import _frame_interval
+from fluoro_calib_ros.findings import Kind
 
 MS = 1_000_000
 INTERVAL = 40 * MS  # frame interval [ns] at 25 Hz
@@ -47,19 +48,20 @@ def test_small_difference_is_no_disagreement(delay_ms):
 
 def test_one_frame_behind_is_told_with_time_and_frames():
     found = disagreement_of_recording(recording(a={}, b={'delay_ns': INTERVAL}))
-    assert 'frames of a and b with the same number are 40.0 ms apart (1.0 frame int' in found
+    assert (found.kind, found.place.fluoroscopes) == (Kind.STAMPS_APART, ('a', 'b'))
+    assert found.numbers == {'apart_ms': pytest.approx(40.0), 'frames': pytest.approx(1.0)}
 
 
 def test_third_fluoroscope_is_compared_too():
     found = disagreement_of_recording(recording(a={}, b={}, c={'delay_ns': -2 * INTERVAL}))
-    assert 'a and c' in found
-    assert '2.0 frame intervals' in found
+    assert found.place.fluoroscopes == ('a', 'c')
+    assert found.numbers['frames'] == pytest.approx(2.0)
 
 
 def test_frames_without_stamps_are_not_compared():
     assert not disagreement_of_recording(recording(a={}, b={'origin_ns': 0}))
     third = recording(a={}, b={'origin_ns': 0}, c={'delay_ns': INTERVAL})
-    assert 'a and c' in disagreement_of_recording(third)
+    assert disagreement_of_recording(third).place.fluoroscopes == ('a', 'c')
 
 
 def test_few_exposures_say_nothing():
@@ -75,7 +77,7 @@ def test_live_pairer_tells_it_and_forgets_it(names):
     for wrong, right in zip(stream('b', delay_ns=INTERVAL), stream('a')):
         for name in names:
             pairer.add(wrong if name == 'b' else Frame(name, right.number, right.stamp_ns))
-    assert 'a and b' in pairer.stamps.disagreement()
+    assert pairer.stamps.disagreement().place.fluoroscopes == ('a', 'b')
     # After a restart of the cameras, the newest exposures count.
     for frames in zip(*(stream(name, 300, origin_ns=2 * 10**12) for name in names)):
         for frame in frames:
@@ -102,8 +104,8 @@ def test_numbers_that_never_grow_are_told_and_give_no_frame_interval(delay_ms):
         for frame in pair:
             pairer.add(frame)
     found = pairer.stamps.disagreement()
-    assert found.startswith('frames of a are not numbered: 20 in a row have the number 7')
-    assert found.endswith('pair frames by stamp')
+    assert (found.kind, found.place.fluoroscopes) == (Kind.FRAMES_UNNUMBERED, ('a',))
+    assert found.numbers == {'number': 7, 'frames': 20}
     number, stamp_ns = np.array([5, 5, 4]), np.array([10, 20, 30])
     assert _frame_interval(number, stamp_ns) == 0
     assert _frame_interval(np.array([5, 7, 6, 8]), np.array([10, 30, 40, 90])) == 17.5

@@ -90,7 +90,7 @@ def reconstruction_state(stalled, publishers=MappingProxyType({}), **changes):
         'streams': streams,
         'rigs': SimpleNamespace(newest='a rig'),
         'pairer': SimpleNamespace(
-            stamps=SimpleNamespace(disagreement=lambda: ''),
+            stamps=SimpleNamespace(disagreement=lambda: None),
             tolerance=StampTolerance(1),
             silent=frozenset(),
         ),

@@ -145,6 +145,7 @@ class Kind(str, Enum):
     SHADOWS_MET = 'shadows_met'
 
     # Rigid bodies and their markers.
+    BODY_DIFFERENT = 'body_different'
     BODY_MIRRORED = 'body_mirrored'
     BODY_NOT_RIGID = 'body_not_rigid'
     BODY_ON_A_LINE = 'body_on_a_line'

@@ -560,6 +560,7 @@ MAKERS = {
     Kind.LEARNING: lambda: state(1, 1),
     Kind.NO_DRIFT: lambda: state(1, 1000),
     Kind.FEW_MARKERS: lambda: _wrong_start(Fake(finding=None, target_id=[4, 5]), 8),
+    Kind.BODY_DIFFERENT: lambda: shape(lambda given: given[[1, 2, 3, 4, 0]] * [1, -1, -1]),
     Kind.BODY_MIRRORED: lambda: shape(lambda given: given * [-1, 1, 1]),
     Kind.BODY_NOT_RIGID: lambda: _stability(_body('femur'), 50.0, 0.5)[0],
     Kind.BODY_ON_A_LINE: lambda: _stability(_body('femur'), 150.0, 0.1)[0],
@@ -579,7 +580,7 @@ MAKERS = {
         )
     ),
     Kind.MARKER_LOOSE: lambda: shape(moves=0.5),
-    Kind.MARKER_MIGRATED: lambda: shape(lambda given: given + np.eye(5, 3)),
+    Kind.MARKER_MIGRATED: lambda: shape(lambda given: given + np.eye(5, 3)[[0, 4, 4, 4, 4]]),
     Kind.MARKERS_EXCHANGED: lambda: shape(lambda given: given[[1, 0, 2, 3, 4]]),
     Kind.CAUSE_SURE: unsure_cause,
     Kind.CHANGE_IDENTIFIED: lambda: healing._identified(0.7, True),
@@ -933,6 +934,11 @@ SENTENCES = {
     Kind.BODY_MIRRORED: (
         'body femur: its coordinates are mirrored: the points in space deviate from them by # '
         'mm, and from their mirror image by # mm'
+    ),
+    Kind.BODY_DIFFERENT: (
+        'body femur: its coordinates deviate from the markers in space by # mm (RMS), more than '
+        'their sd, and no single marker explains it; check ids, axes, units and sd, and whether '
+        'they are of this body'
     ),
     Kind.BODY_NOT_RIGID: (
         'body femur: it is not rigid: its markers deviate from its shape by # mm (RMS; at most '

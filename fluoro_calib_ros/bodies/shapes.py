@@ -47,9 +47,15 @@ FALSE_SHARE = 0.05
 MAX_CONDITION = 120.0
 MAX_MEAN_ERROR_MM = 0.35
 REJECT_TAIL = 2 * float(ndtr(-CERTAIN))
+SCALE_STEPS = 50  # iterations of a factor along one axis and the attitude
 MIN_SD_MM = 1e-3  # a CT measurement that is stated as exact
 REGULAR = 1e-10  # share of a normal matrix' largest element that is added to its diagonal
-_WRONG_BY_CT = (Kind.BODY_SCALED, Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
+_WRONG_BY_CT = (
+    Kind.BODY_DIFFERENT,
+    Kind.BODY_SCALED,
+    Kind.MARKER_MIGRATED,
+    Kind.MARKERS_EXCHANGED,
+)
 
 
 @dataclass(frozen=True)
@@ -161,9 +167,9 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
             return _unchanged(body, [_unseen(body)])
         adjustment = _adjust(body, places, start)
     known = np.isfinite(adjustment.xyz).all(axis=1)
-    findings = _contradictions(body, places, adjustment)
+    findings = _contradictions(body, places, start, adjustment)
     if any(finding.kind in _WRONG_BY_CT for finding in findings):
-        corrected = _with_true_ct(body, findings)
+        corrected = _with_observed_sd(_with_true_ct(body, findings), places, start)
         adjustment = _adjust(corrected, places, _start(corrected, places) or start)
     shape = adjustment.xyz
     frame, relative = _datum(shape[known], adjustment.covariance)
@@ -195,8 +201,7 @@ def _with_observed_sd(
     freedom = 3 * np.count_nonzero(both) - POSE_SIZE
     if not is_unknown.any() or freedom <= 2:
         return body
-    without_ct = replace(body, sd_mm=np.full(len(body.sd_mm), np.inf))
-    shape = _adjust(without_ct, places, start).xyz
+    shape = _adjust(_without_ct(body), places, start).xyz
     equal = np.ones(np.count_nonzero(both))
     squares = _squares_of_fit(body.xyz_mm[both], shape[both], equal)
     sd = max(np.sqrt(squares / (freedom - 2)), MIN_SD_MM)
@@ -209,14 +214,19 @@ def _with_true_ct(body: Body, findings: Sequence[Finding]) -> Body:
     sd = body.sd_mm
     for finding in findings:
         rows = np.flatnonzero(np.isin(body.target_id, finding.place.target_id))
-        if finding.kind == Kind.BODY_SCALED:
-            xyz = finding.numbers['factor'] * xyz
+        if finding.kind == Kind.BODY_DIFFERENT:
+            sd = np.full(len(sd), np.inf)
+        elif finding.kind == Kind.BODY_SCALED:
+            axis = int(finding.numbers['axis'])
+            xyz = xyz * _stretch(finding.numbers['factor'], None if axis < 0 else axis)
         elif finding.kind == Kind.MARKERS_EXCHANGED:
             order = np.arange(len(xyz))
             order[rows] = rows[::-1]
             xyz, sd = xyz[order], sd[order]
         elif finding.kind == Kind.MARKER_MIGRATED:
-            sd = np.where(np.isin(body.target_id, finding.place.target_id), np.inf, sd)
+            is_wrong = np.isin(body.target_id, finding.place.target_id)
+            xyz = np.where(is_wrong[:, None], np.nan, xyz)
+            sd = np.where(is_wrong, np.inf, sd)
     return replace(body, xyz_mm=xyz, sd_mm=sd)
 
 
@@ -595,15 +605,19 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
     return []
 
 
-def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> list[Finding]:
+def _contradictions(
+    body: Body,
+    places: BodyPlaces,
+    start: tuple[NDArray[np.float64], NDArray[np.int64]],
+    adjustment: _Adjustment,
+) -> list[Finding]:
     """Return findings on loose, migrated or exchanged markers, and on bodies that deform."""
     findings = []
     known = body.known & np.isfinite(adjustment.xyz).all(axis=1) & np.isfinite(body.sd_mm)
-    if np.count_nonzero(known) >= 4:
-        rows = np.flatnonzero(known)
-        findings += _wrong_as_a_whole(body, rows, adjustment.xyz[rows]) or _migrated(
-            body, rows, adjustment.xyz[rows]
-        )
+    if np.count_nonzero(known) >= 3 and _against_ct(body, known, adjustment):
+        # Wrong coordinates of CT have bent the shape: judge both by the images alone.
+        adjustment = _adjust(_without_ct(body), places, start)
+        findings += _against_ct(body, known, adjustment)
     test = adjustment.test
     typical = float(np.nanmedian(test)) if np.isfinite(test).any() else 1.0
     limit = _limit_of_ratio(places)
@@ -637,21 +651,39 @@ def _limit_of_ratio(places: BodyPlaces) -> float:
     return float(chdtri(freedom, REJECT_TAIL) / freedom)
 
 
+def _without_ct(body: Body) -> Body:
+    """Return a body whose coordinates do not contribute to its shape."""
+    return replace(body, sd_mm=np.full(len(body.sd_mm), np.inf))
+
+
+def _against_ct(body: Body, known: NDArray[np.bool_], adjustment: _Adjustment) -> list[Finding]:
+    """Return findings on CT coordinates of known markers (m,) that contradict a shape."""
+    rows = np.flatnonzero(known)
+    sd = np.maximum(body.sd_mm[rows], MIN_SD_MM)
+    estimated = adjustment.xyz[rows]
+    return _wrong_as_a_whole(body, rows, estimated, sd) or _migrated(body, rows, estimated, sd)
+
+
 def _wrong_as_a_whole(
-    body: Body, rows: NDArray[np.int64], estimated: NDArray[np.float64]
+    body: Body,
+    rows: NDArray[np.int64],
+    estimated: NDArray[np.float64],
+    sd: NDArray[np.float64],
 ) -> list[Finding]:
     """Return what would make all CT coordinates fit: another scale, or two exchanged markers."""
     given = body.xyz_mm[rows]
-    sd = np.maximum(body.sd_mm[rows], MIN_SD_MM)
-    if _misfit(given, estimated, sd) <= 1:
+    if len(rows) < 4 or _misfit(given, estimated, sd) <= 1:
         return []
-    factor = _scale(given, estimated, sd)
-    if factor is not None:
+    for axis, along in ((None, ''), (0, ' along x'), (1, ' along y'), (2, ' along z')):
+        factor = _scale(given, estimated, sd, axis)
+        if factor is None:
+            continue
         cause = (
-            f'distances between its markers in space are {factor:.4f} times those of its '
+            f'distances between its markers in space are{along} {factor:.4f} times those of its '
             'coordinates: check the voxel size of the CT, and the scale of the phantom'
         )
-        return [_error(body, Kind.BODY_SCALED, cause, {'factor': factor})]
+        numbers = {'factor': factor, 'axis': -1.0 if axis is None else float(axis)}
+        return [_error(body, Kind.BODY_SCALED, cause, numbers)]
     pair = _exchanged(given, estimated, sd)
     if pair is None:
         return []
@@ -663,12 +695,14 @@ def _wrong_as_a_whole(
 
 
 def _migrated(
-    body: Body, rows: NDArray[np.int64], estimated: NDArray[np.float64]
+    body: Body,
+    rows: NDArray[np.int64],
+    estimated: NDArray[np.float64],
+    sd: NDArray[np.float64],
 ) -> list[Finding]:
     """Compare the shape in the images with that of CT, marker by marker."""
     limit = float(chdtri(3, REJECT_TAIL))
     given = body.xyz_mm[rows]
-    sd = np.maximum(body.sd_mm[rows], MIN_SD_MM)
     out: list[int] = []
     while len(rows) - len(out) >= 4:
         kept = [k for k in range(len(rows)) if k not in out]
@@ -678,6 +712,8 @@ def _migrated(
             break
         out.append(kept[worst])
     kept = [k for k in range(len(rows)) if k not in out]
+    if _misfit(given[kept], estimated[kept], sd[kept]) > 1:
+        return [_different(body, given, estimated)]
     rotation, shift = fitted_pose(estimated[kept], given[kept], 1 / sd[kept] ** 2)
     shifts = estimated @ rotation.T + shift - given
     findings = []
@@ -691,6 +727,19 @@ def _migrated(
         numbers = {'distance_mm': distance, 'sd_mm': float(sd[k])}
         findings.append(_warning(body, Kind.MARKER_MIGRATED, cause, numbers, [marker]))
     return findings
+
+
+def _different(body: Body, given: NDArray[np.float64], estimated: NDArray[np.float64]) -> Finding:
+    """Return the finding that coordinates do not fit, whichever of them are excluded."""
+    squares = _squares_of_fit(given, estimated, np.ones(len(given)))
+    rms = float(np.sqrt(squares / len(given)))
+    cause = (
+        f'its coordinates deviate from the markers in space by {rms:.2g} mm (RMS), more than '
+        'their sd, and no single marker explains it; check ids, axes, units and sd, and whether '
+        'they are of this body'
+    )
+    severity = Severity.ERROR if rms > MAX_MEAN_ERROR_MM else Severity.WARNING
+    return replace(_error(body, Kind.BODY_DIFFERENT, cause, {'rms_mm': rms}), severity=severity)
 
 
 def _against_others(
@@ -727,25 +776,37 @@ def _misfit(
     return _squares_of_fit(ct, adjusted, sd) / float(chdtri(3 * len(ct) - POSE_SIZE, REJECT_TAIL))
 
 
+def _stretch(factor: float, axis: int | None) -> NDArray[np.float64]:
+    """Return the factors (3,) of coordinates along an axis, or along all of them."""
+    return np.where([axis in (None, k) for k in range(3)], factor, 1.0)
+
+
 def _scale(
-    ct: NDArray[np.float64], adjusted: NDArray[np.float64], sd: NDArray[np.float64]
+    ct: NDArray[np.float64],
+    adjusted: NDArray[np.float64],
+    sd: NDArray[np.float64],
+    axis: int | None,
 ) -> float | None:
-    """Return the factor of CT coordinates that makes them fit, or None.
+    """Return the factor of CT coordinates along an axis, or all, that makes them fit, or None.
 
     None, too, if they fit without a single marker, which may have migrated. Least squares; Horn,
-    "Closed-form solution of absolute orientation", J. Opt. Soc. Am. A 4, 1987, section 2.D.
+    "Closed-form solution of absolute orientation", J. Opt. Soc. Am. A 4, 1987, section 2.D. With
+    one axis, the attitude depends on the factor: repeated until both agree.
     """
-    weight = (1 / sd**2)[:, None]
-    rotation, shift = fitted_pose(adjusted, ct, weight[:, 0])
-    fitted = adjusted @ rotation.T + shift
-    arm = ct - np.sum(weight * ct, axis=0) / weight.sum()
-    factor = float(np.sum(weight * arm * fitted) / np.sum(weight * arm * arm))
-    if _misfit(factor * ct, adjusted, sd) > 1:
-        return None
     others = ~np.eye(len(ct), dtype=bool)
     if any(_misfit(ct[row], adjusted[row], sd[row]) <= 1 for row in others):
         return None
-    return factor
+    weight = (1 / sd**2)[:, None]
+    arm = ct - np.sum(weight * ct, axis=0) / weight.sum()
+    part = slice(None) if axis is None else slice(axis, axis + 1)
+    factor = 1.0
+    for _ in range(SCALE_STEPS):
+        scaled = _stretch(factor, axis) * ct
+        rotation, shift = fitted_pose(adjusted, scaled, weight[:, 0])
+        fitted = adjusted @ rotation.T + shift
+        along = (weight * arm)[:, part]
+        factor = float(np.sum(along * fitted[:, part]) / np.sum(along * arm[:, part]))
+    return factor if _misfit(_stretch(factor, axis) * ct, adjusted, sd) <= 1 else None
 
 
 def _exchanged(

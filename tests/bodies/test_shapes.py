@@ -179,6 +179,26 @@ def of_other_voxels(true, given):
     given *= 1.03
 
 
+def of_thicker_slices(true, given):
+    given[:, 2] *= 1.3
+
+
+def of_another_body(true, given):
+    given[:] = given[[1, 2, 3, 4, 0]] * [1, -1, -1]
+
+
+@pytest.mark.parametrize(('error_mm', 'severity'), [(0.5, Severity.WARNING), (9, Severity.ERROR)])
+def test_three_markers_that_are_not_those_of_ct_are_named(error_mm, severity):
+    """No single one can be told; the frame is as uncertain as they deviate."""
+    rng = np.random.default_rng(6)
+    given = by_ct(rng, CORNERS[:3], 0.02).xyz_mm + np.outer([0, 0, 1], [0, error_mm, 0])
+    body = Body('femur', np.arange(3) + 1, given, np.full(3, 0.02))
+    shape = estimate_shape(body, recording(rng, CORNERS[:3]))
+    (found,) = shape.findings
+    assert (found.kind, found.severity) == (Kind.BODY_DIFFERENT, severity)
+    assert np.sqrt(np.diagonal(shape.body.frame_covariance)[:3]).max() > 0.1 * error_mm
+
+
 @pytest.mark.parametrize(
     ('change', 'kind', 'markers'),
     [
@@ -187,6 +207,8 @@ def of_other_voxels(true, given):
         (mirrored, Kind.BODY_MIRRORED, ()),
         (in_cm, Kind.WRONG_UNIT, ()),
         (of_other_voxels, Kind.BODY_SCALED, ()),
+        (of_thicker_slices, Kind.BODY_SCALED, ()),
+        (of_another_body, Kind.BODY_DIFFERENT, ()),
     ],
 )
 def test_wrong_coordinates_of_ct_are_named(change, kind, markers):
@@ -200,10 +222,16 @@ def test_wrong_coordinates_of_ct_are_named(change, kind, markers):
     if change is of_other_voxels:
         assert shape.findings[0].severity == Severity.ERROR
         assert shape.findings[0].numbers['factor'] == pytest.approx(1 / 1.03, abs=0.002)
-    if change in (exchanged, of_other_voxels):  # the frame is that of CT
+    if change is of_thicker_slices:
+        assert shape.findings[0].numbers['axis'] == 2
+        assert shape.findings[0].numbers['factor'] == pytest.approx(1 / 1.3, abs=0.01)
+    if change is of_another_body:  # the frame is not known, and says so
+        assert shape.findings[0].severity == Severity.ERROR
+        assert np.sqrt(np.diagonal(shape.body.frame_covariance)[:3]).min() > 3
+    if change in (exchanged, of_other_voxels, of_thicker_slices):  # the frame is that of CT
         assert np.abs(shape.body.xyz_mm - CORNERS).max() < 4 * CT_SD_MM
         assert np.sqrt(np.diagonal(shape.body.frame_covariance)[:3]).max() < CT_SD_MM
-    if markers or change is of_other_voxels:  # wrong CT coordinates do not contribute to the shape
+    if markers or Kind.BODY_SCALED is kind:  # wrong CT coordinates do not contribute to the shape
         assert np.abs(relative_errors(shape, CORNERS)).max() < 0.03
 
 

@@ -96,6 +96,7 @@ class Kind(str, Enum):
     # A fixed calibration applied to other exposures.
     CORRECTED_ALREADY = 'corrected_already'
     POOR_CALIBRATION_FIT = 'poor_calibration_fit'
+    REUSED_EXPOSURES = 'reused_exposures'
 
     # Pairing of frames by number or by stamp.
     FRAMES_UNNUMBERED = 'frames_unnumbered'
@@ -170,6 +171,7 @@ class Kind(str, Enum):
     # Files that do not belong together.
     EDITED_RESULT = 'edited_result'
     EXCHANGED_CALIBRATION = 'exchanged_calibration'
+    FAILED_VERDICT = 'failed_verdict'
     NOT_IN_BOTH = 'not_in_both'
     WRONG_FORMAT = 'wrong_format'
 

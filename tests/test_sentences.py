@@ -57,7 +57,7 @@ from fluoro_calib_ros.images import detection, extraction, lattice, matching
 from fluoro_calib_ros.images.codec import as_grey
 from fluoro_calib_ros.images.growth import Seen
 from fluoro_calib_ros.images.marker_watch import doubt_in
-from fluoro_calib_ros.io.calibration import edited, exchanged
+from fluoro_calib_ros.io.calibration import edited, exchanged, failed
 from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.jobs import healing, result_folder
@@ -68,6 +68,7 @@ from fluoro_calib_ros.jobs.bodies import _apart, _impossible
 from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
 from fluoro_calib_ros.jobs.extraction import ImageResult, bent_shadows
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
+from fluoro_calib_ros.jobs.result_folder import reused_exposures
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 from fluoro_calib_ros.reconstruction import epipolar, lost_targets, observed_noise
@@ -234,6 +235,13 @@ def disagreement(numbers):
         partner = by_number.get(frame.number) if numbers(1) != (7, 7) else streams['b'][row]
         agreement.add({'a': frame, 'b': partner} if partner else {'a': frame})
     return agreement.disagreement()
+
+
+def reused():
+    """Return the finding on exposures that a calibration has used."""
+    target = 'fluoro_calib_ros.jobs.result_folder.read_calibrated_frames'
+    with mock.patch(target, return_value={'a': frames()}):
+        return reused_exposures('result', {}, {'a': frames()})
 
 
 def trial(kind):
@@ -551,6 +559,8 @@ MAKERS = {
     Kind.BEAD_UNSURE: unsure_bead,
     Kind.BEADS_NOT_MEASURED: not_measured,
     Kind.BEAD_LOST: lambda: bead(measured=False),
+    Kind.FAILED_VERDICT: lambda: failed('result', {'verdict': 'fail'}),
+    Kind.REUSED_EXPOSURES: reused,
     Kind.EDITED_RESULT: lambda: edited('result', {'digest': 'x'}),
     Kind.EXCHANGED_CALIBRATION: lambda: exchanged(
         'result', {'fluoroscopes': {'a': {'calibration_id': 'x'}}}, {'a': Fake(calibration_id='y')}
@@ -910,6 +920,14 @@ SENTENCES = {
         'the phantom is found with # beads, of which only # can be measured'
     ),
     Kind.BEAD_LOST: 'cut off, or lost while it was measured',
+    Kind.FAILED_VERDICT: (
+        'result: the verdict on the calibration is fail: its results may be wrong: fluoro-calib '
+        'report result shows the reasons'
+    ),
+    Kind.REUSED_EXPOSURES: (
+        '# of # exposures were used for the calibration: they do not show how accurate it is with '
+        'others: record exposures that it has not used'
+    ),
     Kind.EDITED_RESULT: (
         'result/result.json: the file was changed after it was written, its figures may not '
         'match the calibration: restore it, or calibrate again'

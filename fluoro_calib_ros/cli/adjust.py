@@ -51,7 +51,12 @@ def run(arguments: argparse.Namespace) -> bool:
     """
     from ..io.folder import check_output_folder
     from ..jobs.calibration import adjust
-    from ..jobs.result_folder import RESULT_FOLDER, save_result, written_document
+    from ..jobs.result_folder import (
+        RESULT_FOLDER,
+        reused_exposures,
+        save_result,
+        written_document,
+    )
     from ..jobs.sources import select_calibrations
     from ..report.tables import summary_table
 
@@ -61,11 +66,12 @@ def run(arguments: argparse.Namespace) -> bool:
     calibrations = select_calibrations(calibrations, frames, arguments.calibration)
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)
     save_result(arguments.out, result, covariance=arguments.covariance)
-    print_findings(result.findings, 'doubtful: ')
+    reused = reused_exposures(arguments.calibration, calibrations, frames)
+    print_findings((*result.findings, *([reused] if reused else [])), 'doubtful: ')
     holds = not any(f.kind is Kind.POOR_CALIBRATION_FIT for f in result.findings)
     text = HOLDS if holds else DOES_NOT_HOLD
     verdict = styled_verdict(text, 'pass' if holds else 'fail')
-    document = {**written_document(result), 'holds': holds}
+    document = {**written_document(result), 'holds': holds, 'out_of_sample': reused is None}
     table = summary_table(result, has_notes=False).rstrip()  # they are already printed
     print_result(arguments, document, f'{table}\n\n{verdict}')
     return holds

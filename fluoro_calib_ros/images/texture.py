@@ -43,9 +43,9 @@ RATIOS = STEP**COMPARED
 BETWEEN = make_interp_spline(COMPUTED, np.eye(len(COMPUTED)))(COMPARED)
 ROUNDS = 3  # iterations over the strengths and the factor on the noise
 EM_STEPS = 30  # iterations after which the share of windows has converged to 0.01
-# Directions across edges, 7.5 degrees apart: at the border of a window, an edge is then off by less
-# than its blur. That in which the light changes most is taken: with the likeliest of all, errors in
-# renderings with plates were 6 to 11 % larger. NO_EDGE: the background has no straight edge.
+# Directions across edges, 7.5 degrees apart: at the border of a window, an edge is then off by
+# less than its blur. The light changes most in that of an edge: if the likeliest of all directions
+# was taken, errors in renderings with plates were 6 to 11 % larger. NO_EDGE: there is no edge.
 DIRECTIONS = 24
 NO_EDGE = -1
 

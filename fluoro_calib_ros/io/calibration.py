@@ -288,7 +288,8 @@ def with_digest(document: Mapping[str, Any]) -> dict[str, Any]:
 def disagreements(directory: PathLike, calibrations: Calibrations) -> list[Finding]:
     """Return a finding for each contradiction between result.json, the verdict and the files.
 
-    There are none without result.json. A file that cannot be read gives a finding.
+    A verdict that is fail is one, too. There are none without result.json. A file that cannot be
+    read gives a finding.
     """
     try:
         document = read_result(directory)
@@ -298,7 +299,7 @@ def disagreements(directory: PathLike, calibrations: Calibrations) -> list[Findi
     findings = (
         exchanged(directory, document, calibrations),
         edited(directory, document),
-        changed_since_verdict(directory, verdict),
+        changed_since_verdict(directory, verdict) or failed(directory, verdict),
     )
     return [finding for finding in findings if finding is not None]
 
@@ -351,6 +352,19 @@ def changed_since_verdict(directory: PathLike, verdict: Mapping[str, Any]) -> Fi
     except DataError as error:
         return error.finding
     return _edited(directory, changed[0], 'the verdict does not apply to it') if changed else None
+
+
+def failed(directory: PathLike, verdict: Mapping[str, Any]) -> Finding | None:
+    """Return a finding if a verdict is fail."""
+    if verdict.get('verdict') != 'fail':
+        return None
+    return Finding(
+        Kind.FAILED_VERDICT,
+        'the verdict on the calibration is fail: its results may be wrong',
+        Place(name=str(directory)),
+        f'fluoro-calib report {directory} shows the reasons',
+        Severity.WARNING,
+    )
 
 
 @dataclass(frozen=True)

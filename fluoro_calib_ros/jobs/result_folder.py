@@ -11,12 +11,14 @@ from typing import Any
 
 from ..bodies.shapes import LearnedShapes
 from ..checks.check import Check
+from ..checks.inputs import shared_exposures
 from ..checks.residual_tests import doubtful_observations
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
+from ..exposures.frame import Frames
 from ..exposures.names import Names
-from ..findings import Finding, Kind, Severity
+from ..findings import Finding, Kind, Place, Severity
 from ..io import csv_table as names
 from ..io.access import PathLike, read_bytes, write_bytes
 from ..io.calibration import (
@@ -36,7 +38,7 @@ from ..io.calibration import (
 )
 from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import RESULT_NAME as RESULT
-from ..io.calibration_request import RADIOGRAPHS, write_request
+from ..io.calibration_request import RADIOGRAPHS, read_calibrated_frames, write_request
 from ..io.decisions import DOUBTFUL, doubtful_table
 from ..io.documents import write_json
 from ..io.folder import PREVIOUS, FolderKind, check_output_folder, replaced_folder
@@ -215,6 +217,31 @@ def _saved_ids(directory: PathLike, calibrations: Calibrations) -> list[str]:
     except DataError:
         return []
     return [saved[name].calibration_id for name in calibrations if name in saved]
+
+
+def reused_exposures(
+    directory: PathLike, calibrations: Calibrations, frames: Frames
+) -> Finding | None:
+    """Return a warning if frames are among those that the calibrations of a folder were made from.
+
+    None, too, if the folder does not contain the latter.
+    """
+    try:
+        earlier = read_calibrated_frames(Path(directory), calibrations)
+    except DataError:
+        return None
+    used = {name: shared_exposures(earlier.get(name, ()), own) for name, own in frames.items()}
+    count = max(map(len, used.values()), default=0)
+    if not count:
+        return None
+    return Finding(
+        Kind.REUSED_EXPOSURES,
+        f'{count} of {max(map(len, frames.values()))} exposures were used for the calibration',
+        Place(tuple(name for name, pairs in used.items() if pairs), name=''),
+        'they do not show how accurate it is with others: record exposures that it has not used',
+        Severity.WARNING,
+        numbers={'exposures': count},
+    )
 
 
 def saved_orientation(directory: PathLike) -> RigOrientation | None:

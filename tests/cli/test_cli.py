@@ -797,6 +797,16 @@ def test_decisions_are_inputs_of_every_command(command):
     assert found == given - {'out'}
 
 
+def test_adjust_names_exposures_that_the_calibration_has_used(rig, result, tmp_path, capsys):
+    words = ('--phantom', rig / 'phantom.csv', '--calibration', result, '--out', tmp_path / 'out')
+    for source, is_new in ((rig / 'calibration', False), (rig / 'test', True)):
+        capsys.readouterr()
+        run('adjust', source, *words, '--json')
+        printed = capsys.readouterr()
+        assert json.loads(printed.out)['out_of_sample'] is is_new
+        assert ('were used for the calibration' in printed.err) is not is_new
+
+
 def test_adjust_does_not_overwrite_its_decisions(rig, result, tmp_path, capsys):
     """The table of doubtful points of an earlier adjustment is a part of its folder."""
     out = tmp_path / 'out'

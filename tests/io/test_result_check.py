@@ -7,11 +7,11 @@ import json
 import shutil
 
 import pytest
-from rigs import calibrated, exposures, rig, run
+from rigs import calibrated, exposures, kinds, rig, run
 
 from fluoro_calib_ros.checks.check import Check, Validation
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
-from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.io.calibration import disagreements, load_calibrations
 from fluoro_calib_ros.io.calibration_request import write_request
 from fluoro_calib_ros.io.result_document import write_validation
@@ -127,11 +127,19 @@ def forge(path):
     ],
 )
 def test_a_verdict_is_of_the_whole_folder(judged, name, change):
-    assert disagreements(judged, load_calibrations(judged)) == []
+    assert kinds(disagreements(judged, load_calibrations(judged))) == [Kind.FAILED_VERDICT]
     change(judged / name)
     (found,) = disagreements(judged, load_calibrations(judged))
     assert str(judged / name) in str(found)
     assert found.kind in (Kind.EDITED_RESULT, Kind.DATA)
+
+
+def test_a_verdict_that_is_fail_is_told_by_every_reader(folder, capsys):
+    write_validation(folder, Validation('fail', (), {}, 0.0))
+    (found,) = disagreements(folder, load_calibrations(folder))
+    assert (found.kind, found.severity) == (Kind.FAILED_VERDICT, Severity.WARNING)
+    assert correct(folder) == 0
+    assert 'the verdict on the calibration is fail' in capsys.readouterr().err
 
 
 def test_a_forged_verdict_is_not_reported(judged):

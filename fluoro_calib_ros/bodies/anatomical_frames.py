@@ -33,6 +33,12 @@ SIDES = ('left', 'right')
 # If a landmark is picked to 1 mm, the direction of a line of 50 mm is uncertain by this [rad].
 MIN_SINE = 0.02
 MIN_LENGTH_MM = 1.0
+# Minimum sine of the angle of both directions of a frame. They are 80 to 100 degrees apart in long
+# bones, and 60 in the thorax.
+MIN_SINE_OF_BONE = 0.7
+# Maximum ratio of the extents of the landmarks of two bones at a joint. It is 2 for femur, tibia
+# and pelvis, and 4 for radius and metacarpal.
+MAX_RATIO = 6.0
 
 
 @dataclass(frozen=True)
@@ -253,6 +259,13 @@ def frame_of_landmarks(
     orthogonal = second - (second @ first) * first
     if np.linalg.norm(orthogonal) < MIN_SINE:
         raise DataError(f'the landmarks {", ".join(names)} lie on a line')
+    if np.linalg.norm(orthogonal) < MIN_SINE_OF_BONE:
+        degrees = float(np.rad2deg(np.arccos(abs(second @ first))))
+        raise DataError(
+            f'the {recipe.first.axis} axis and the direction to '
+            f'{" and ".join(recipe.second.end)} are only {degrees:.0f} degrees apart, as in no '
+            'bone: a coordinate of a landmark is wrong'
+        )
     frame = frame_of_axes(
         {recipe.first.axis: first, recipe.second.axis: orthogonal}, _mean(recipe.origin, points)
     )
@@ -319,6 +332,7 @@ class Convention:
     proximal_landmarks: str = ''
     distal_landmarks: str = ''
     origins_meet: bool = False  #: whether both origins are at the joint
+    hinge: bool = False  #: whether the joint mainly rotates about its first axis
     #: least and largest value of each angle [deg] that no joint exceeds
     limits_deg: tuple[tuple[float, float], ...] = ((-np.inf, np.inf),) * 3
 
@@ -415,6 +429,7 @@ _CLINICAL = (
         proximal_landmarks='femur_grood_suntay',
         distal_landmarks='tibia_grood_suntay',
         origins_meet=True,
+        hinge=True,
         limits_deg=(_HINGE, _SAME_SIDE, _SAME_SIDE),
     ),
     _isb(

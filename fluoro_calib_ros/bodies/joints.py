@@ -26,9 +26,17 @@ from scipy.spatial.transform import Rotation
 
 from ..brief import brief_repr
 from ..errors import DataError, ErrorsAt
+from ..findings import Kind
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from ..rows import chosen_rows
-from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame, Convention, convention
+from .anatomical_frames import (
+    AXES,
+    BODY_FRAME,
+    MAX_RATIO,
+    AnatomicalFrame,
+    Convention,
+    convention,
+)
 from .body import Body, BodyPoses, PoseStatus
 
 # Distance from gimbal lock in standard deviations. At this distance the first angle has a standard
@@ -252,6 +260,39 @@ def check_frames(joint: Joint, bodies: Iterable[Body]) -> None:
                     'three markers of the body have no coordinates, in which a frame can be given'
                 )
             frame.check_body(body.centre)
+    extents = sorted(frame.extent_mm for frame in frames.values())
+    if extents[1] < np.inf and extents[1] > MAX_RATIO * extents[0]:
+        raise DataError(
+            f'joint {joint.name}: the landmarks of one bone are {extents[1]:.3g} mm apart, those '
+            f'of the other {extents[0]:.3g} mm: a coordinate or a unit is wrong',
+            kind=Kind.WRONG_UNIT,
+            numbers={'larger_mm': extents[1], 'smaller_mm': extents[0]},
+        )
+
+
+def main_rotation(motion: JointMotion) -> tuple[float, float] | None:
+    """Return range [rad] and direction of the main rotation of a joint, or None.
+
+    The direction is the larger angle [rad] between its axis and the first axis of the convention
+    in both frames. The axis is that of the largest variance of the rotations about their mean;
+    None if another axis has more than a ninth of it, and without known angles.
+    """
+    of = convention(motion.joint.convention)
+    known = np.isfinite(motion.angles).all(axis=1)
+    if not known.any():
+        return None
+    signed = motion.angles[known] * np.array(of.angle_signs)
+    rotation = Rotation.from_euler(of.sequence.upper(), signed)
+    mean = rotation.mean()
+    vectors = (mean.inv() * rotation).as_rotvec()
+    vectors -= vectors.mean(axis=0)
+    variance, axes = np.linalg.eigh(vectors.T @ vectors)
+    if variance[2] <= 9 * variance[1]:
+        return None
+    low, high = np.quantile(vectors @ axes[:, 2], (0.05, 0.95))
+    along = [axes[:, 2], mean.apply(axes[:, 2])]
+    cosine = np.abs(along)[:, AXES.index(of.sequence[0])].min()
+    return float(high - low), float(np.arccos(min(cosine, 1.0)))
 
 
 def _check_poses(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> None:

@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 from ..bodies.anatomical_frames import BODY_FRAME, convention
 from ..bodies.body import AXIS_MM, STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
-from ..bodies.joints import Joint, JointMotion, JointStatus, joint_motion, with_neutral
+from ..bodies.joints import (
+    Joint,
+    JointMotion,
+    JointStatus,
+    joint_motion,
+    main_rotation,
+    with_neutral,
+)
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
 from ..brief import brief_repr
@@ -507,7 +514,8 @@ def _on_joints(
         for request in requests
         if request.neutral is None or _has_frames(request.joint)
     ]
-    doubts = [*map(_apart, motions), *map(_impossible, _joints(absolute, poses, poses))]
+    given = _joints(absolute, poses, poses)
+    doubts = [*map(_apart, motions), *(_impossible(one) or _bends_elsewhere(one) for one in given)]
     return [finding for finding in doubts if finding is not None]
 
 
@@ -526,6 +534,9 @@ def _unseen(poses: BodyPoses) -> Finding:
 # half the distance between its landmarks, and it is exceeded in no more than a few exposures.
 MAX_ORIGINS_MM = 100.0
 MAX_ORIGINS = 0.5
+# Largest angle between the axis about which a hinge is seen to bend, by as much or more, and the
+# flexion axis of its bones. In the knee, where rotation accompanies flexion, it is 10 degrees.
+MAX_AXIS_RAD = np.deg2rad(30.0)
 FEW = 0.05  # share of exposures whose poses may be wrong
 
 
@@ -578,6 +589,23 @@ def _impossible(motion: JointMotion) -> Finding | None:
                 numbers={'least_deg': float(least), 'most_deg': float(most)},
             )
     return None
+
+
+def _bends_elsewhere(motion: JointMotion) -> Finding | None:
+    """Return a finding if a hinge bends about another axis than that of its frames, or None."""
+    joint = motion.joint
+    main = main_rotation(motion) if convention(joint.convention).hinge else None
+    if main is None or not main[0] > MAX_AXIS_RAD < main[1]:
+        return None
+    degrees = float(np.rad2deg(main[1]))
+    return Finding(
+        Kind.JOINT_IMPOSSIBLE,
+        f'it bends about an axis {degrees:.0f} degrees from the flexion axis of its bones',
+        place=Place(name=f'joint {joint.name}'),
+        advice='check the side, which body is proximal, and the landmarks',
+        severity=_severity(joint),
+        numbers={'axis_deg': degrees},
+    )
 
 
 # Result folder of the bodies of a recording.

@@ -26,9 +26,11 @@ from fluoro_calib_ros.bodies.joints import (
     angle_errors,
     check_joints,
     joint_motion,
+    main_rotation,
     with_neutral,
 )
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.jobs.bodies import _bends_elsewhere
 
 CLINICAL = [name for name in CONVENTIONS if not name.startswith(('cardan', 'euler'))]
 JCS = [name for name in CLINICAL if CONVENTIONS[name].along_axes]
@@ -557,6 +559,33 @@ def test_bones_of_the_other_side_and_mirrored_bones_are_refused(kind, side):
     exchanged = {**bone, pair[0]: bone[pair[1]], pair[1]: bone[pair[0]]}
     with pytest.raises(DataError, match='two landmarks are exchanged'):
         frame_of_landmarks(kind, exchanged, side)
+
+
+def test_a_bone_whose_axes_are_nearly_parallel_is_refused():
+    """The lateral plateau with a wrong sign: 50 degrees from the perpendicular."""
+    bone = mannequin('tibia_grood_suntay', 'right')
+    bone['lateral_plateau'] = bone['lateral_plateau'] + [0, 0, 60]
+    with pytest.raises(DataError, match='a coordinate of a landmark is wrong'):
+        frame_of_landmarks('tibia_grood_suntay', bone, 'right')
+
+
+def bending(axis, degrees):
+    """Motion of a right knee from -20 degrees about an axis (3,) of the femur, and back."""
+    angles = np.deg2rad(np.linspace(-20, degrees, 50))
+    d = poses('d', Rotation.from_rotvec(np.outer(-angles, axis)).as_matrix())
+    joint = Joint('knee', 'p', 'd', 'grood_suntay_knee', side='right')
+    return joint_motion(joint, poses('p', np.broadcast_to(np.eye(3), (50, 3, 3))), d)
+
+
+@pytest.mark.parametrize('away_deg', [0.0, 10.0, 40.0])
+def test_the_main_rotation_of_a_knee_shows_where_it_bends(away_deg):
+    away = np.deg2rad(away_deg)
+    span, angle = main_rotation(bending([np.cos(away), np.sin(away), 0], 60))
+    assert span == pytest.approx(np.deg2rad(72), rel=0.01)  # 90 % of it
+    assert angle == pytest.approx(away, abs=1e-6)
+    found = _bends_elsewhere(bending([np.cos(away), np.sin(away), 0], 60))
+    assert (found is not None) == (away_deg > 30)
+    assert _bends_elsewhere(bending([np.cos(away), np.sin(away), 0], 5)) is None
 
 
 def test_the_second_landmark_direction_only_spans_a_plane():

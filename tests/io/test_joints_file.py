@@ -90,6 +90,16 @@ def test_a_frame_is_in_the_coordinates_of_its_body(tmp_path):
     in_cm = KNEE.replace('[0, 0, 400]', '[0, 0, 40]').replace('25, -20', '2.5, -2')
     with rigs.refused(Kind.WRONG_UNIT):
         read_joints(written(tmp_path, in_cm), [body('femur', near), tibia])
+    tibia_frame = KNEE[KNEE.index('[joint.distal_frame]') :]
+    landmarks = (
+        'medial_eminence = [5, 0, 0]\nlateral_eminence = [-5, 0, 0]\n'
+        'ankle_centre = [0, 0, -3800]\n'
+        'medial_plateau = [25, 0, 0]\nlateral_plateau = [-25, 0, 0]\n'
+    )
+    long = KNEE.replace(tibia_frame, '[joint.distal_frame.landmarks]\n' + landmarks)
+    with rigs.refused(Kind.WRONG_UNIT, larger_mm=pytest.approx(3800, abs=1)):
+        read_joints(written(tmp_path, long), [body('femur', near), tibia])
+    read_joints(written(tmp_path, long.replace('3800', '380')), [body('femur', near), tibia])
     unknown = body('femur', np.where(np.arange(4)[:, None] < 2, near, np.nan))
     with pytest.raises(DataError, match='frame of femur: three markers'):
         read_joints(written(tmp_path, KNEE), [unknown, tibia])

@@ -168,10 +168,7 @@ class ParameterGroup(Generic[T]):
     def declarations(self) -> dict[str, Option]:
         """Declared options by parameter name, in the order of `names`."""
         options = declared(self.options)
-        return {
-            parameter: replace(options[name], name=parameter)
-            for name, parameter in self._names.items()
-        }
+        return {new: replace(options[name], name=new) for name, new in self._names.items()}
 
     def declare(self, node: Node) -> T:
         """Declare the parameters on a node, return their values. Raises StartError if invalid."""
@@ -217,14 +214,12 @@ class ParameterGroup(Generic[T]):
         values = {name: _tuple_or_value(declarations[name], values[name]) for name in declarations}
         for name, declaration in declarations.items():
             declaration.validate(values[name])
+        arguments = {name: values[parameter] for name, parameter in self._names.items()}
         try:
-            return self.options(
-                **{name: values[parameter] for name, parameter in self._names.items()}
-            )
-        except ValueError as error:
-            names = self._names
-            words = re.split(r'(\w+)', str(error))
-            raise ValueError(''.join(names.get(word, word) for word in words)) from None
+            return self.options(**arguments)
+        except ValueError as error:  # names the options
+            text = re.sub(r'\w+', lambda word: self._names.get(word[0], word[0]), str(error))
+            raise ValueError(text) from None
 
 
 def group(

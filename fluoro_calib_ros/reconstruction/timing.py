@@ -31,10 +31,12 @@ from .intersection import IntersectedPoints
 from .reconstruct import CorrectedView, RigRecording, match_views
 
 MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
+MAX_POINTS = 10_000  # number of their image points in a: 50 each
 MIN_SIGMAS = 5.0  # minimum delay over its standard deviation: one in a million by chance
 MAX_LAG = 12  # maximum delay by whole frames, and 1/LAG_SHARE of the exposures
 LAG_SHARE = 8
 MAX_FRAMES = 1.0  # maximum rest of a delay: neighbouring frames show no motion beyond them
+SURE_PART = 0.02  # difference from a whole frame interval below which a delay may be whole
 WHOLE = 0.1  # maximum difference of an uncertain delay from a frame interval that it may be
 TIE = 1e-6  # makes frames that are missing less likely than equally likely ones
 MIN_NOISE_PX = 1e-3  # minimum noise of image points
@@ -472,7 +474,8 @@ def delay_finding(names: tuple[str, str], delay: Delay, interval_s: float) -> Fi
     first, name = names
     size = abs(delay.frames)
     shift = -round(delay.frames)
-    if shift and abs(delay.frames + shift) < min(delay.margin, WHOLE):  # the likelier cause
+    may_be_whole = min(max(delay.margin, SURE_PART), WHOLE)
+    if shift and abs(delay.frames + shift) < may_be_whole:  # the likelier cause
         cause = (
             f'the frame numbers of fluoroscope {name} are too {"small" if shift < 0 else "large"} '
             f'by {abs(shift)}'
@@ -525,7 +528,8 @@ class ViewsOfPair(Generic[AnyFrame]):
     def track(self, rows: range) -> Track:
         """Return the points of exposures, of at most MAX_EXPOSURES that are evenly spaced."""
         steps = np.linspace(0, len(rows) - 1, min(MAX_EXPOSURES, len(rows)))
-        parts = [self._points(rows[step]) for step in steps.astype(int)]
+        most = MAX_POINTS // max(len(steps), 1)
+        parts = [self._points(rows[step], most) for step in steps.astype(int)]
         points = joined_rows([self._no_points(), *parts])
         in_a, in_b = points.uv[:, 0], points.uv[:, 1:]
         sigma_a, sigma_b = points.sigma[:, 0], points.sigma[:, 1:]
@@ -550,19 +554,20 @@ class ViewsOfPair(Generic[AnyFrame]):
             ids, ids, np.zeros((0, count, 2)), np.zeros((0, count)), np.zeros((0, count))
         )
 
-    def _points(self, row: int) -> Points:
-        """Return the points of an exposure."""
+    def _points(self, row: int, most: int) -> Points:
+        """Return the points of an exposure, at most so many of its targets."""
         of_a, of_b = self.exposures[row]
         numbers = range(of_b.number - self._most, of_b.number + self._most + 1)
         frames = [of_a, *map(self._b.get, numbers)]
         matched = match_views([None if f is None else self._corrected(f) for f in frames])
-        seen = np.isfinite(matched.uv[0, :, 0])
+        seen = np.flatnonzero(np.isfinite(matched.uv[0, :, 0]))
+        seen = seen[:: -(-len(seen) // most) or 1]
         sigma = matched.sigma[:, seen].T
         # An error of the correction is the same in neighbouring frames: it is no noise.
         noise = np.maximum(sigma**2 - matched.correction_sd[:, seen].T ** 2, MIN_NOISE_PX**2)
         return Points(
             np.asarray(matched.target_id)[seen],
-            np.full(np.count_nonzero(seen), row),
+            np.full(len(seen), row),
             np.swapaxes(matched.uv[:, seen], 0, 1),
             sigma=sigma,
             noise=noise,

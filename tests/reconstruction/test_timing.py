@@ -189,6 +189,8 @@ def test_noise_has_the_stated_losses():
     [
         (0.9, 0.01, Kind.FRAMES_DELAYED),
         (0.99, 0.01, Kind.FRAMES_SHIFTED),
+        (3.01, 0.001, Kind.FRAMES_SHIFTED),
+        (3.05, 0.001, Kind.FRAMES_DELAYED),
         (-0.8, 0.05, Kind.FRAMES_DELAYED),
         (-0.95, 0.02, Kind.FRAMES_SHIFTED),
     ],

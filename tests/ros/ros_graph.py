@@ -508,6 +508,8 @@ class Client(Node):
 
     def close(self):
         self._spinner.shutdown()
+        for action in (self._action, self._heal):  # they would keep the node in the graph
+            action.destroy()
         self.destroy_node()
 
 

@@ -3,7 +3,9 @@
 
 """The lifecycle of the streaming nodes, their parameters, and two rigs at the same time."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -162,7 +164,16 @@ def test_every_transition_and_a_clean_end(graph, node):
     ):
         assert change(client, node, transition), transition
     assert state(client, node) == State.PRIMARY_STATE_ACTIVE
+    segments = own_segments(process)
     assert process.end() == 0 and 'Traceback' not in process.log
+    assert not [path for path in segments if path.exists()], 'it has left the graph'
+
+
+def own_segments(process):
+    """Return the files of Fast DDS in shared memory that a process has locked as their owner."""
+    links = Path(f'/proc/{process.pid}/fd').iterdir()
+    targets = [link.readlink() for link in links if link.is_symlink()]
+    return [path for path in targets if re.fullmatch(r'fastrtps_[0-9a-f]+_el', path.name)]
 
 
 def test_shutdown_by_the_lifecycle(graph, by_command):

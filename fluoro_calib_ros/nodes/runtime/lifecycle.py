@@ -81,6 +81,11 @@ class ManagedNode(ParameterNode, LifecycleNode):
         self._try(self.deactivate)
         self._try(self.cleanup)
 
+    def destroy_node(self) -> None:
+        """Destroy the node and its state machine, which would keep it in the graph."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def destroy_publisher(self, publisher: Publisher) -> bool:
         """Destroy a publisher, possibly a lifecycle publisher."""
         return self.destroy_lifecycle_publisher(publisher)

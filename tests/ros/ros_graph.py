@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, JointState, PointCloud2
 from tf2_msgs.msg import TFMessage
+from unique_identifier_msgs.msg import UUID
 from visualization_msgs.msg import MarkerArray
 
 from fluoro_calib_ros.exposures.frame import Frame
@@ -325,6 +327,12 @@ class Client(Node):
         self.published = 0
         self._action = ActionClient(self, SelfCalibrate, 'self_calibrate')
         self._heal = ActionClient(self, Heal, 'heal')
+        # An ActionClient drops the feedback that it has not taken before the result.
+        self._goal_id = UUID()
+        for action, kind in (('self_calibrate', SelfCalibrate), ('heal', Heal)):
+            self.create_subscription(
+                kind.Impl.FeedbackMessage, f'{action}/_action/feedback', self._on_feedback, deep
+            )
 
     # -- waiting
 
@@ -415,6 +423,10 @@ class Client(Node):
         self.create_subscription(kind, topic, collected.append, qos)
         return collected
 
+    def _on_feedback(self, message):
+        if message.goal_id == self._goal_id:
+            self.feedback.append(message.feedback)
+
     def _on_diagnostics(self, array):
         for status in array.status:
             if status.name.startswith(self.get_namespace() + '/'):
@@ -490,7 +502,10 @@ class Client(Node):
         )
 
     def goal(self, **fields):
-        """Return the handle of an accepted goal; its feedback is collected in .feedback."""
+        """Return the handle of an accepted goal.
+
+        Its feedback is collected in .feedback, where the last ones may arrive after the result.
+        """
         return self._sent(self._action, SelfCalibrate.Goal(**fields))
 
     def heal(self, **fields):
@@ -499,10 +514,8 @@ class Client(Node):
 
     def _sent(self, action, goal):
         self.feedback = []
-        feedback = self.feedback
-        handle = self.result_of(
-            action.send_goal_async(goal, feedback_callback=lambda m: feedback.append(m.feedback))
-        )
+        self._goal_id = UUID(uuid=list(uuid.uuid4().bytes))
+        handle = self.result_of(action.send_goal_async(goal, goal_uuid=self._goal_id))
         assert handle.accepted
         return handle
 

@@ -63,12 +63,9 @@ def stream(module_graph, by_command, tracking):
     """1,600 messages of each fluoroscope; every tenth message of a is damaged in some way."""
     graph = module_graph
     client = module_graph.client
-    graph.nodes = graph.whole_chain(by_command)
     graph.corrected = {name: client.listen(f'{name}/corrected_observations') for name in NAMES}
     graph.points = client.listen('reconstruction/points_with_covariance')
-    client.wait_until(
-        lambda: client.count_publishers('reconstruction/points_with_covariance'), what='the points'
-    )
+    graph.nodes = graph.whole_chain(by_command)
     graph.wait_for_readers(2)
     kinds = itertools.cycle(KINDS)
     graph.damaged = {number: next(kinds) for number in range(5, COUNT, 10)}

@@ -30,12 +30,8 @@ def test_camera_info_of_another_camera_does_not_restart_the_drift_watch(
 ):
     """The other camera is named, and the watch keeps its previous observations."""
     client = graph.client
-    node = graph.whole_chain(by_command)['reconstruction_node']
     points = client.listen('reconstruction/points_with_covariance')
-    client.wait_until(
-        lambda: client.count_publishers('reconstruction/points_with_covariance'), what='the node'
-    )
-    client.wait_until_known_to('reconstruction_node')
+    node = graph.whole_chain(by_command)['reconstruction_node']
 
     def show(numbers):
         for number in numbers:
@@ -73,17 +69,9 @@ def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):
     client = graph.client
     foreign = client.create_publisher(CameraInfo, 'a/camera_info', latched_qos())
     foreign.publish(CameraInfo())
-    nodes = graph.whole_chain(by_command)
-    node = nodes['reconstruction_node']
     points = client.listen('reconstruction/points_with_covariance')
-    client.wait_until(
-        lambda: (
-            client.count_publishers('reconstruction/points_with_covariance')
-            and foreign.get_subscription_count()
-        ),
-        what='the reconstruction node',
-    )
-    client.wait_until_known_to('reconstruction_node')
+    node = graph.whole_chain(by_command)['reconstruction_node']
+    client.wait_until(foreign.get_subscription_count, what='the reconstruction node')
 
     def warned(info, text):
         foreign.publish(info)  # publish again: the message of the correction node may replace it

@@ -81,8 +81,8 @@ def test_correction_before_and_after_a_calibration_in_mid_stream(
     a = load_calibrations(other)['a']
     save_calibration(other, replace(a, interior=a.interior + [0, 0, 1.0]))
     second = ids_in(other)['a']
-    graph.start('correction_node')
     corrected = client.listen('a/corrected_observations')
+    graph.start('correction_node')
     pairs = (
         tuple(replace(tracking[n][i % 300], number=i + 1) for n in NAMES)
         for i in itertools.count()

@@ -342,17 +342,14 @@ def test_two_rigs_in_parallel(node_server, request, graph, by_command, tracking,
     other = Graph(tmp_path / 'other', node_server)
     request.node.graphs = [*getattr(request.node, 'graphs', ()), other]
     try:
+        for one in (graph, other):
+            one.points = one.client.listen('reconstruction/points_with_covariance')
         graph.whole_chain(by_command)
         other.both_nodes(by_command)
         simulated = other.start(
             'reconstruction_node', {'use_sim_time': 'true', 'pair_by': 'stamp'}
         )
         for one in (graph, other):
-            one.points = one.client.listen('reconstruction/points_with_covariance')
-            one.client.wait_until(
-                lambda: one.client.count_publishers('reconstruction/points_with_covariance'),
-                what='the nodes',
-            )
             one.wait_for_readers(1)
         other.client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'))
         other.client.wait_for_diagnostics(

@@ -80,22 +80,15 @@ class Rig:
         self.frames = {name: [later(frame) for frame in bumped[name]] for name in NAMES}
         self.bag = folder / 'bumped'
         write_bag(self.bag, self.frames)
+        self.points = self.client.listen('reconstruction/points_with_covariance')
+        self.orientations = self.client.listen('rig_orientation')
+        self.transforms = self.client.listen('/tf_static')
         # One exposure fewer would not be enough.
         nodes = graph.whole_chain(
             self.folder, learn_bodies=self.bodies, learn_time=(EXPOSURES - 1.5) / 60
         )
         self.reconstruction = nodes['reconstruction_node']
-        self.points = self.client.listen('reconstruction/points_with_covariance')
-        self.orientations = self.client.listen('rig_orientation')
-        self.transforms = self.client.listen('/tf_static')
-        self.client.wait_until(
-            lambda: (
-                self.orientations
-                and self.client.count_publishers('reconstruction/points_with_covariance')
-            ),
-            what='the first orientation',
-        )
-        graph.wait_for_readers(1)
+        self.client.wait_until(lambda: self.orientations, what='the first orientation')
         assert not (self.folder / LEARNED_SHAPES).exists()
         self.publish(self.healthy)
         self.client.wait_for_diagnostics(
@@ -246,7 +239,10 @@ def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
     assert answer.status == SUCCEEDED, answer.result.message
     result = answer.result
     expected = rig.by_command(tmp_path, capsys)
-    assert {f.stage for f in rig.client.feedback} == {'collecting', 'diagnosing'}
+    rig.client.wait_until(
+        lambda: {f.stage for f in rig.client.feedback} == {'collecting', 'diagnosing'},
+        what='the feedback of both stages',
+    )
     assert result.exposures == expected['exposures'] and result.verdict == 'pass'
     assert result.orientation_id == expected['orientation_id']
     assert result.findings == [one['sentence'] for one in expected['findings']]
@@ -481,13 +477,13 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, learned):
     client = graph.client
     before = load_orientation(orientation_path(learned)).orientation_id
     orientations = client.listen('rig_orientation')
+    points = client.listen('reconstruction/points_with_covariance')
     graph.whole_chain(
         learned,
         {'heal_on_drift': True},
         heal_accept=True,
         heal_time=1.0,
     )
-    points = client.listen('reconstruction/points_with_covariance')
     healthy, bumped = (
         list(stream_of(rig, virtual, rig.motion)) for virtual in (virtual_rig(SEED), bumped_rig())
     )
@@ -525,8 +521,8 @@ def test_nothing_is_learned_after_an_alarm_of_the_drift_watch(rig, graph, calibr
     """Nor after restarts of the node that raised the alarm and of the one that received it."""
     client = graph.client
     parameters = {'learn_bodies': rig.bodies, 'learn_time': 600.0}
-    nodes = graph.whole_chain(calibrated, **parameters)
     points = client.listen('reconstruction/points_with_covariance')
+    nodes = graph.whole_chain(calibrated, **parameters)
 
     def told(message):
         client.wait_for_diagnostics('calibration_node', lambda s: message in s.message, 'shapes')
@@ -551,12 +547,8 @@ def test_nothing_is_learned_after_an_alarm_of_the_drift_watch(rig, graph, calibr
 
 def test_no_exposure_is_lost_while_shapes_are_learned(rig, graph, calibrated):
     client = graph.client
-    graph.whole_chain(calibrated, learn_bodies=rig.bodies, learn_time=2.0)
     points = client.listen('reconstruction/points_with_covariance')
-    client.wait_until(
-        lambda: client.count_publishers('reconstruction/points_with_covariance'), what='points'
-    )
-    graph.wait_for_readers(1)
+    graph.whole_chain(calibrated, learn_bodies=rig.bodies, learn_time=2.0)
     client.stream(rig.stream([rig.healthy]), RATE_HZ, lambda: len(points))
     client.wait_for_diagnostics(
         'calibration_node', lambda s: s.message.startswith('shapes of'), 'shapes', 'shapes'

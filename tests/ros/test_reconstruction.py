@@ -27,11 +27,10 @@ def rig(module_graph, by_command, tracking):
     graph = module_graph
     client = module_graph.client
     graph.fork = False
-    graph.nodes = graph.whole_chain(by_command, {'drift_rate': 1000.0})
     for topic in ('points_with_covariance', 'points', 'markers', 'drift'):
         client.listen(f'reconstruction/{topic}')
-        client.wait_until(lambda: client.count_publishers(f'reconstruction/{topic}'), what=topic)
     client.listen('/tf_static')
+    graph.nodes = graph.whole_chain(by_command, {'drift_rate': 1000.0})
     publish(client, tracking, range(FRAMES))
     graph.points = client.messages['reconstruction/points_with_covariance']
     return graph

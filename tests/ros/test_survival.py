@@ -23,8 +23,8 @@ class Rig:
         self.graph = graph
         self.folder = folder
         self.client = graph.client
-        self.nodes = graph.whole_chain(folder)
         self.points = self.client.listen(POINTS)
+        self.nodes = graph.whole_chain(folder)
         self._pairs = list(zip(*(tracking[n][:COUNT] for n in NAMES)))
 
     def stream(self, later_s=0.0, number=0):

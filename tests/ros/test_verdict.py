@@ -40,6 +40,10 @@ def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
     assert done.status == SUCCEEDED and done.result.verdict == 'fail'
     assert 'the residuals have a trend of' in done.result.findings[0]
     assert done.result.message.endswith('; verdict: fail')
+    client.wait_until(
+        lambda: any(f.stage and f.step == f.steps - 1 for f in client.feedback),
+        what='the last feedback',
+    )
     steps = [feedback for feedback in client.feedback if feedback.stage]
     assert [feedback.step for feedback in steps] == list(range(steps[0].steps))
     assert feedback_text(steps[-1]).startswith('verdict: 83 %, b: ')

@@ -117,6 +117,9 @@ def test_action_gives_feedback_and_the_same_result(rig, by_service):
         handle.get_result_async(), JOB_DEADLINE, 'the result of the action'
     )
     assert answer.status == SUCCEEDED and answer.result.success
+    rig.client.wait_until(
+        lambda: len(rig.client.feedback) == sum(by_service.iterations), what='all feedback'
+    )
     for field in RESULT_FIELDS:
         assert list(getattr(answer.result, field)) == list(getattr(by_service, field)), field
     for f, name in enumerate(NAMES):

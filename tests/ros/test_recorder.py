@@ -4,6 +4,7 @@
 """The recorder: the bag holds what was published, as rosbag2 would have written it."""
 
 import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from std_msgs.msg import Int32, String
 from fluoro_calib_ros.io.bags.metadata import type_hash
 from fluoro_calib_ros.io.bags.reader import read_frames, topics_of
 from fluoro_calib_ros.io.bags.salvage import inspect_bag, recover_bag
-from fluoro_calib_ros.nodes.runtime.topics import latched_qos
+from fluoro_calib_ros.nodes.runtime.topics import TopicDiscovery, latched_qos
 
 
 def recorded(status, key='messages'):
@@ -180,19 +181,34 @@ def peer(graph):
     rclpy.shutdown(context=context)
 
 
+def test_types_of_publishers_that_differ_prevent_a_recording_until_one_has_ended(
+    graph, peer, monkeypatch
+):
+    """A recorder that knows only one of them yet records that one."""
+    client = graph.client
+    topic = f'{graph.namespace}/note'
+    other = peer.create_publisher(Int32, topic, 10)
+    client.create_publisher(String, topic, 10)
+    client.wait_until(lambda: client.count_publishers(topic) == 2)
+    said = []
+    monkeypatch.setattr(client, 'get_logger', lambda: SimpleNamespace(warning=said.append))
+    topics = TopicDiscovery(client, [topic], 'recorded')
+    assert not [*topics.new(), *topics.new()]
+    types = 'std_msgs/msg/Int32, std_msgs/msg/String'
+    assert said == [f'{topic} is not recorded: it has the types {types}']
+    peer.destroy_publisher(other)
+    (found,) = client.wait_until(lambda: list(topics.new()), what='the topic')
+    assert (found.name, found.kind) == (topic, String)
+
+
 def test_types_of_subscribers_do_not_prevent_a_recording(graph, peer, tmp_path):
-    """Types of publishers that differ do, until one of them has ended."""
     client = graph.client
     topic = f'{graph.namespace}/note'
     peer.create_subscription(Int32, topic, print, 10)
-    other = peer.create_publisher(Int32, topic, 10)
+    client.wait_until(lambda: client.count_subscribers(topic))
+    graph.start('recorder_node', {'folder': tmp_path / 'bag', 'topics': f'[{topic}]'})
     publisher = client.create_publisher(String, topic, 10)
-    client.wait_until(lambda: client.count_publishers(topic) == 2)
-    recorder = graph.start('recorder_node', {'folder': tmp_path / 'bag', 'topics': f'[{topic}]'})
-    wait = client.wait_until
-    wait(lambda: f'{topic} is not recorded: it has the types std_msgs/msg/Int32' in recorder.log)
-    peer.destroy_publisher(other)
-    wait(publisher.get_subscription_count, what='the subscription')
+    client.wait_until(publisher.get_subscription_count, what='the subscription')
     client.wait_until_known_to('recorder_node')
     publisher.publish(String(data='x'))
     client.wait_for_diagnostics('recorder_node', lambda s: recorded(s) == 1, 'recorder')

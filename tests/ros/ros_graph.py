@@ -56,7 +56,7 @@ from visualization_msgs.msg import MarkerArray
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.nodes.messages.bodies import FORMS
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
-from fluoro_calib_ros.nodes.runtime.topics import OBSERVATION_DEPTH, latched_qos, observations_qos
+from fluoro_calib_ros.nodes.runtime.topics import OBSERVATION_DEPTH, latched_qos
 
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
@@ -66,26 +66,28 @@ NAMES = ('a', 'b')
 SUCCEEDED = GoalStatus.STATUS_SUCCEEDED
 CANCELED = GoalStatus.STATUS_CANCELED
 ABORTED = GoalStatus.STATUS_ABORTED
+# For the client, on a machine that is too busy to keep up with the rate of a stream.
+DEEP = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 TOPICS = {
-    'target_observations': (TargetObservations, observations_qos()),
-    'corrected_observations': (CorrectedObservations, observations_qos()),
+    'target_observations': (TargetObservations, DEEP),
+    'corrected_observations': (CorrectedObservations, DEEP),
     'calibration': (FluoroscopeCalibration, latched_qos()),
     'camera_info': (CameraInfo, latched_qos()),
     'calibration_status': (CalibrationStatus, 10),
-    'retractions': (Retraction, observations_qos()),
+    'retractions': (Retraction, DEEP),
     'rig_orientation': (RigOrientation, latched_qos()),
-    'points_with_covariance': (ReconstructedPoints, observations_qos()),
-    'points': (PointCloud2, observations_qos()),
-    'markers': (MarkerArray, observations_qos()),
-    'body_poses': (BodyPoses, observations_qos()),
-    'pose': (PoseWithCovarianceStamped, observations_qos()),
-    'odometry': (Odometry, observations_qos()),
-    'joint_angles': (JointAngles, observations_qos()),
-    'joint_states': (JointState, observations_qos()),
-    'tf': (TFMessage, observations_qos()),
+    'points_with_covariance': (ReconstructedPoints, DEEP),
+    'points': (PointCloud2, DEEP),
+    'markers': (MarkerArray, DEEP),
+    'body_poses': (BodyPoses, DEEP),
+    'pose': (PoseWithCovarianceStamped, DEEP),
+    'odometry': (Odometry, DEEP),
+    'joint_angles': (JointAngles, DEEP),
+    'joint_states': (JointState, DEEP),
+    'tf': (TFMessage, DEEP),
     'drift': (DriftStatus, 10),
     'tf_static': (TFMessage, latched_qos()),
-    **{name: (kind, observations_qos()) for name, (kind, _) in FORMS.items()},
+    **{name: (kind, DEEP) for name, (kind, _) in FORMS.items()},
 }
 
 SERVICES = {
@@ -315,10 +317,8 @@ class Client(Node):
         self._callers = {}
         for service, kind in SERVICES.items():
             self.expect(kind, service)
-        # Deep enough for a machine that is too busy to keep up with the rate.
-        deep = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
         self._outputs = {
-            n: self.create_publisher(TargetObservations, f'{n}/target_observations', deep)
+            n: self.create_publisher(TargetObservations, f'{n}/target_observations', DEEP)
             for n in NAMES
         }
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
@@ -331,7 +331,7 @@ class Client(Node):
         self._goal_id = UUID()
         for action, kind in (('self_calibrate', SelfCalibrate), ('heal', Heal)):
             self.create_subscription(
-                kind.Impl.FeedbackMessage, f'{action}/_action/feedback', self._on_feedback, deep
+                kind.Impl.FeedbackMessage, f'{action}/_action/feedback', self._on_feedback, DEEP
             )
 
     # -- waiting

@@ -48,7 +48,7 @@ def ports(tmp_path_factory):
         yield
 
 
-ROS = ('tests/ros 1', 'tests/ros 2')
+ROS = 'tests/ros/'
 # Files whose tests share the calibrations of tests/rigs.py or tests/turning_rig.py: they run in
 # the same worker, so that each calibration is computed once.
 SHARING = (
@@ -64,8 +64,19 @@ SHARING = (
     'tests/checks/test_turning.py',
     'tests/checks/test_validation.py',
 )
-# Other files that take more than 20 s of CPU time. Short files fill the gaps at the end.
+# Scopes that take more than 20 s, longest first. Short ones fill the gaps at the end.
 LENGTHY = (
+    'tests/ros/test_extraction_node.py',
+    'tests/ros/test_live_healing.py',
+    'tests/ros/test_live_angles.py',
+    'tests/ros/test_whole_graph.py',
+    'tests/ros/test_start_and_end.py',
+    'tests/ros/test_jobs.py',
+    'tests/ros/test_images.py',
+    'tests/ros/test_integration.py',
+    'tests/ros/test_orienting.py',
+    'tests/ros/test_web.py',
+    SHARING[0],
     'tests/healing/test_healing.py',
     'tests/estimation/test_survey.py',
     'tests/report/test_experiment.py',
@@ -86,29 +97,24 @@ if LoadFileScheduling is not None:
         """Keep the tests of a file on one worker, and all tests with ROS nodes on two.
 
         The tests of a file share fixtures, and those of SHARING calibrations. ROS nodes mostly
-        wait, so two workers run them while a third one computes; more graphs at once would only
-        slow each other down.
+        wait, so two workers run them, file by file, while a third one computes; more graphs at
+        once would only slow each other down.
         """
-
-        def __init__(self, *arguments) -> None:
-            super().__init__(*arguments)
-            self._files_of_ros = []
 
         def _split_scope(self, nodeid: str) -> str:
             name = super()._split_scope(nodeid)
-            if name in SHARING:
-                return SHARING[0]
-            if not name.startswith('tests/ros/'):
-                return name
-            if name not in self._files_of_ros:
-                self._files_of_ros.append(name)
-            return ROS[self._files_of_ros.index(name) % len(ROS)]
+            return SHARING[0] if name in SHARING else name
 
         def _assign_work_unit(self, node) -> None:
-            """Start with the scopes that take longest."""
-            for scope in reversed((*ROS, SHARING[0], *LENGTHY)):
-                if scope in self.workqueue:
-                    self.workqueue.move_to_end(scope, last=False)
+            """Assign a scope with ROS nodes to the first two workers, while there are any."""
+            of_ros = [scope for scope in self.workqueue if scope.startswith(ROS)]
+            others = [scope for scope in self.workqueue if not scope.startswith(ROS)]
+            scopes = (of_ros if node in self.nodes[:2] else []) or others
+            if not scopes:
+                node.shutdown()
+                return
+            longest = next((scope for scope in LENGTHY if scope in scopes), scopes[0])
+            self.workqueue.move_to_end(longest, last=False)
             super()._assign_work_unit(node)
 
     @pytest.hookimpl(optionalhook=True)

@@ -152,9 +152,10 @@ def calibration(model: str = 'knn') -> FluoroscopeCalibration:
 
 @functools.cache
 def _calibration(model: str) -> FluoroscopeCalibration:
-    exposures = simulate_exposures(rig(), 3, 1).frames
+    exposures = simulate_exposures(rig(), 3, 1).frames['a']
+    few = [frame.rows(frame.target_id % 3 == 0) for frame in exposures]
     request = CalibrationOptions(model=model, k=5 if model == 'knn' else None, max_iterations=2)
-    result = calibrate({'a': exposures['a']}, rig().phantom, request)
+    result = calibrate({'a': few}, rig().phantom, request)
     return result.calibrations['a']
 
 

@@ -7,6 +7,7 @@ import argparse
 import csv
 import filecmp
 import html
+import io
 import json
 import os
 import pathlib
@@ -752,16 +753,23 @@ def test_version(capsys):
     assert re.match(r'fluoro_calib_ros \S.* \(Python 3\.\d+\.\d+', capsys.readouterr().out)
 
 
-def test_output_of_any_name_is_told_on_any_terminal(rig, result, tmp_path):
+def test_output_of_any_name_is_told_on_any_terminal(result, tmp_path, monkeypatch, capsys):
     """The result is written; a terminal that cannot show its name gets it escaped."""
-    environment = {**os.environ, 'PYTHONIOENCODING': 'ascii'}
+
+    def shown(*words):
+        terminal = io.TextIOWrapper(io.BytesIO(), encoding='ascii')
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, 'stdout', terminal)
+            assert run(*words) == 0
+        terminal.flush()
+        assert capsys.readouterr().err == ''
+        return terminal.buffer.getvalue().decode('ascii')
+
     points = tmp_path / 'points.csv'
     points.write_text('fluoroscope,u,v\na,500,500\n')
     words = ('correct', points, '--calibration', result, '--out', tmp_path / 'Größe.csv')
-    done = command(*words, env=environment)
-    assert done.returncode == 0 and done.stderr == ''
-    assert 'Gr\\xf6\\xdfe.csv' in done.stdout
-    told = json.loads(command(*words, '--json', env=environment).stdout)
+    assert 'Gr\\xf6\\xdfe.csv' in shown(*words)
+    told = json.loads(shown(*words, '--json'))
     assert told['out'] == str(tmp_path / 'Größe.csv')
 
 

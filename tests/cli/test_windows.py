@@ -8,8 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from rigs import exposures
 
 from fluoro_calib_ros.io.calibration import load_calibrations
+from fluoro_calib_ros.jobs.simulation import write_bag
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 
@@ -29,7 +31,12 @@ for module, names in (
         delattr(module, name)
 if __name__ == '__main__':
 """
-COMMAND = '    from fluoro_calib_ros.cli import main\n    sys.exit(main(sys.argv[1:]))\n'
+COMMANDS = """
+    from fluoro_calib_ros.cli import main
+
+    for model in ('none', 'parametric'):  # the second replaces the first
+        main([*sys.argv[1:], '--model', model])
+"""
 WORKER = """
     from fluoro_calib_ros.processes import in_worker_process
 
@@ -52,9 +59,9 @@ def run(tmp_path):
 
 def test_commands_need_no_function_that_windows_lacks(run, tmp_path):
     out = tmp_path / 'result'
-    words = (BAGS / 'calibration', '--phantom', BAGS / 'phantom.csv', '--fluoroscopes', 'a')
-    for model in ('none', 'parametric'):  # the second replaces the first
-        run(COMMAND, 'calibrate', *words, '--fast', '--model', model, '--out', out)
+    write_bag(tmp_path / 'few', {'a': exposures(5)['a']})
+    words = (tmp_path / 'few', '--phantom', BAGS / 'phantom.csv', '--fluoroscopes', 'a')
+    run(COMMANDS, 'calibrate', *words, '--fast', '--out', out)
     assert load_calibrations(out)['a'].model.kind == 'parametric'
     assert load_calibrations(f'{out}.previous')['a'].model.kind == 'none'
 

@@ -326,15 +326,15 @@ def test_markers_of_the_simulator_are_followed(graph):
 
 
 def test_markers_are_followed_in_both_views_together(graph, calibrated):
-    """Uses the calibrations of both fluoroscopes; an exposure may lack one view."""
-    rate = 0.2  # a busy machine renders a view in seconds; a view one exposure late is lost
+    """Uses the calibrations of both fluoroscopes."""
+    rate = 0.2
     tracking = simulate_tracking(virtual_rig(1), 6.0, rate, 1, 0.0)
     markers = graph.directory / 'markers.csv'
     write_observations_csv(markers, {name: tracking.frames[name][:1] for name in NAMES})
     found = {name: graph.client.listen(f'{name}/target_observations') for name in NAMES}
     together = {'mode': 'markers', 'markers': markers, 'calibration_directory': calibrated}
     node = graph.start('extraction_node', together)
-    scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 2, 'noise': 0.0}
+    scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 1, 'noise': 0.0}
     simulator = graph.start('simulator_node', {**scene, 'wait_for_readers': 1}, wait=False)
     graph.client.wait_until(lambda: all(found.values()), JOB_DEADLINE, 'the markers of both views')
     assert simulator.wait() == 0, simulator.log
@@ -360,7 +360,7 @@ def test_bodies_give_the_ids_of_the_first_markers(graph, calibrated):
     found = {name: graph.client.listen(f'{name}/target_observations') for name in NAMES}
     together = {'mode': 'markers', 'bodies': bodies, 'calibration_directory': calibrated}
     node = graph.start('extraction_node', together)
-    scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 2, 'noise': 0.0}
+    scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 1, 'noise': 0.0}
     simulator = graph.start('simulator_node', {**scene, 'wait_for_readers': 1}, wait=False)
     graph.client.wait_until(lambda: all(found.values()), JOB_DEADLINE, 'the markers of both views')
     assert simulator.wait() == 0, simulator.log

@@ -482,7 +482,7 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, learned):
         learned,
         {'heal_on_drift': True},
         heal_accept=True,
-        heal_time=1.0,
+        heal_time=2.0,
     )
     healthy, bumped = (
         list(stream_of(rig, virtual, rig.motion)) for virtual in (virtual_rig(SEED), bumped_rig())
@@ -495,7 +495,7 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, learned):
             stamp_ns = 10**18 + number * 2 * 10**7
             yield [replace(f, number=number, stamp_ns=stamp_ns) for f in pair]
 
-    client.stream(stream(), 2 * RATE_HZ)
+    client.stream(stream(), RATE_HZ, lambda: len(points))
     client.wait_for_diagnostics(
         'reconstruction_node', lambda s: int(value_of(s, 'observations') or 0) > 4500, 'drift'
     )

@@ -42,6 +42,17 @@ def pytest_sessionfinish() -> None:
 
 
 @pytest.fixture(scope='session', autouse=True)
+def shared_results(tmp_path_factory):
+    """Let the workers of a run share calibrations; see once() in tests/rigs.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        if 'PYTEST_XDIST_WORKER' in os.environ:
+            folder = tmp_path_factory.getbasetemp().parent / 'shared'
+            folder.mkdir(exist_ok=True)
+            patch.setenv('FLUORO_CALIB_TEST_SHARED', str(folder))
+        yield
+
+
+@pytest.fixture(scope='session', autouse=True)
 def ports(tmp_path_factory):
     """Reserve ports before any test creates a node: Fast DDS reads its profile only once."""
     with own_ports(tmp_path_factory.mktemp('dds')):

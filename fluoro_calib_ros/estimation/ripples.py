@@ -19,11 +19,13 @@ from scipy.special import stdtrit
 
 from ..correction.series import MARGIN, Functions
 from ..exposures.collector import MIN_EXPOSURES
-from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.outliers import FALSE_ALARM
 
 # Number of sines along the image to search: ripples shorter than 53 px on 1024 px.
 SEARCHED_BANDS = 50
+# Standard deviations by which the mean power of a band with ripples must exceed that of noise.
+# With 4, the sharp seam of two plates was taken for ripples.
+SIGNIFICANT = 5.0
 BESIDE_PEAK = 0.2  # least power of a band of the ripples, relative to the strongest band
 LEAST_EXCESS = 0.1  # least initial power of a band in excess of the noise
 
@@ -117,7 +119,7 @@ def shown_ripples(
     bands = np.arange(len(number))
     # The power of a sine is a mean of two squares and has a standard deviation of one. The image
     # determines only a part of the sines over their rectangle.
-    shown = (excess > CERTAIN * MARGIN / np.sqrt(number)) & (bands > complete)
+    shown = (excess > SIGNIFICANT * MARGIN / np.sqrt(number)) & (bands > complete)
     if shown.any():
         shown[shown] = _are_common(functions, uv, residuals, exposure, bands[shown])
     if not shown.any():

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .marker_motion import AGREE
-from .marker_rays import NEAR, MarkerExposure, MarkerRays
+from .marker_rays import AGREE, NEAR, MarkerExposure, MarkerRays
 from .markers import MarkerFrame, MarkerTracker
 
 

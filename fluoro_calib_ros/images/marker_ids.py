@@ -35,9 +35,8 @@ from .marker_intensity import (
     check_image,
     first_shadows,
 )
-from .marker_motion import AGREE
 from .marker_points import ShadowPoints, all_among, shadow_points
-from .marker_rays import CHANCE, MIN_SEEN, CalibratedRig
+from .marker_rays import AGREE, CHANCE, MIN_SEEN, CalibratedRig
 from .markers import MIN_MEMBERS, FirstMarkers
 from .matching import CLOSER
 

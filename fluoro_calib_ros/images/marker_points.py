@@ -22,8 +22,8 @@ from ..correction.fluoroscope_calibration import CorrectedPoints
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints
-from .marker_motion import AGREE, SHADOW_SD_PX
-from .marker_rays import CalibratedRig, RayFit
+from .marker_motion import SHADOW_SD_PX
+from .marker_rays import AGREE, CalibratedRig, RayFit
 
 
 @dataclass(frozen=True)

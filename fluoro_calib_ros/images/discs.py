@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-SMOOTH_PX = 1.0  # blur that reduces the noise of the light, and the pixel steps of distances
+SMOOTH_PX = 1.0  # standard deviation of the blur that reduces the noise of the light
+BORDER_PX = 0.7  # standard deviation of the blur that smooths the pixel steps of the distances
 # Smaller discs that overlap are not separated: two discs that are a radius apart leave a dip of
 # 0.13 radii between their centres, which the blur removes.
 MIN_RADIUS_PX = 3.0
 SIZES = (0.8, 1.25)  # least and largest radius of a disc, relative to the typical one
 APART = 0.5  # distance in radii below which two maxima are the same disc
 MIN_STRAIGHT = 3  # pairs of discs in a straight line from which a part of the mask is a bar
+SAME = 0.1  # distance in radii within which a blob is a disc; the place of the blob is better
 
 
 def set_apart(
@@ -37,7 +39,7 @@ def set_apart(
     smooth = cv2.GaussianBlur(relative.astype(np.float32), (0, 0), SMOOTH_PX)
     mask = (smooth < half).astype(np.uint8)
     distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    distance = cv2.GaussianBlur(distance, (0, 0), SMOOTH_PX)
+    distance = cv2.GaussianBlur(distance, (0, 0), BORDER_PX)
     radius = float(np.median(distance[row, column]))
     if radius < MIN_RADIUS_PX:
         return uv, None
@@ -50,7 +52,7 @@ def set_apart(
     if not len(discs):
         return uv, None
     disc_distance, nearest = cKDTree(discs).query(uv)
-    exact = disc_distance < 1  # discs are at whole pixels: the place of a blob is better
+    exact = disc_distance < SAME * radius
     has_blob = np.isin(np.arange(len(discs)), nearest[exact])
     return np.concatenate([uv[exact | (disc_distance > radius)], discs[~has_blob]]), radius
 

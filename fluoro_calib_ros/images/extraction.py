@@ -21,7 +21,7 @@ from .background import MIN_DIRECT
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
 from .growth import LAST_TOLERANCE_PX, MIN_SHARE, Match, Seen, nearby_residuals, supported
-from .imaging import DEPTH, Expected, Imaging, first_imaging
+from .imaging import Expected, Imaging, first_imaging
 from .matching import MIN_BEADS, PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, measure_beads
 from .shadow_fit import MAX_SIGMA_PX, UNDISTURBED, Beads
@@ -33,6 +33,7 @@ WRONG_SHARE = 1e-3
 WRONG_SIGMAS = np.sqrt(-2 * np.log(WRONG_SHARE))
 SURE_SIGMA_PX = 0.5 / WRONG_SIGMAS
 MAX_SIGMAS = 2.9  # largest standard deviation over the usual one: an eighth of the weight
+DEPTH = (0.55, 1.7)  # depth of a shadow relative to the usual depth in such light
 RADII = (0.2, 5.0)  # radii of shadows of equal beads, relative to a typical one
 # Share of the shifts of shadows by distortion within them that remains after the correction: 0.46,
 # 0.57 and 0.63 with shadows of 17 px (`benchmarks.calibrated_renderings`, large beads).
@@ -265,7 +266,7 @@ def _away(measured: _Measured) -> NDArray[np.bool_]:
     sigma = measured.beads.sigma[good]
     scatter = measured.sd_px[good]
     residual = measured.residual[good]
-    # WRONG_SHARE of the images lose a bead by chance (Rayleigh's distribution).
+    # One image in 1 / WRONG_SHARE loses a bead by chance: the lengths have Rayleigh's distribution.
     limit = np.sqrt(-2 * np.log(WRONG_SHARE / max(len(residual), 1)))
     near = residual < limit * np.hypot(scatter, sigma)
     away = np.zeros(len(good), dtype=bool)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .pose_search import LocalPose
-from .shadow_fit import ROBUST
-from .view import DEGREE, Lens, View, fit_view
+from .view import DEGREE, TAIL, Lens, View, fit_view
 
 GROWTH = 1.25  # factor on the radius in each step
 MIN_SHARE = 0.5  # least share of expected beads; a pose with less is discarded
@@ -212,7 +211,7 @@ def _judged(
     # A detection between two predictions may belong to either.
     tree = cKDTree(predicted[row])
     distance, _ = tree.query(seen.uv[detection], k=2)
-    is_unique = distance[:, 1] > distance[:, 0] + ROBUST * scale
+    is_unique = distance[:, 1] > distance[:, 0] + TAIL * scale
     matched = np.zeros(len(row), dtype=bool)
     matched[bead[is_unique]] = True
     good = supported(xyz[row], matched) & supported(predicted[row], is_found)
@@ -283,7 +282,7 @@ def interpolated(
     for _ in range(ROUNDS):
         value, variance = matched.at(residual, noise)
         squared = np.sum((residual - value) ** 2, axis=1) / variance
-        noise = share * (1 + squared / (ROBUST**2 * _scale(squared)))
+        noise = share * (1 + squared / (TAIL**2 * _scale(squared)))
     value, variance = kriging.at(residual, noise)
     squared = np.sum((residual - value[bead]) ** 2, axis=1) / variance[bead]
     return Interpolation(value, np.sqrt(_scale(squared) * variance))

@@ -45,7 +45,6 @@ SETTLED = 0.1 * RADIUS_SD  # relative change of the radius at which a profile ha
 STEP = 1.25  # ratio of consecutive sizes in the first comparison
 SIZES = STEP ** np.arange(-4, 5)
 FINER_STEPS = (STEP**0.5, STEP**0.25, STEP**0.125)  # ratios of sizes in the refinements
-DEPTH = (0.5, 1.8)  # depth of a shadow, relative to that of the bead, or of beads in such light
 FEW = 5  # isolated beads below which overlapping beads are used for the profile as well
 OTHERS = 0.2  # largest share of beads in the sample with another object next to them
 ROUNDS = 2  # the second round uses a profile of beads of one size

@@ -24,14 +24,17 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 MIN_VARIANCE = 1 / 12  # variance of rounding to integers
-SAMPLED = 100_000  # pixels for the estimates of noise and correlation
-SURE = 3.0  # significance limit of a correlation, or a difference of counts [standard deviations]
+SAMPLED = 100_000  # pixels for the noise estimate: they give the median of each level to 2 %
+LEVELS = 30  # levels of light at which the noise is estimated
+SURE_CORRELATION = 3.0  # significance limit of a correlation [standard deviations]
 LAGS = 4  # largest lag at which noise is correlated [px]
 SECOND = np.array([1.0, -2.0, 1.0])  # kernel of second differences
-MIN_SEEN = 0.1  # least share of the noise in second differences, or in the changes of the light
+MIN_SEEN = 0.1  # least share of the variance in second differences: noise blurred by a pixel
+MIN_CLIPPED = 10  # largest number of outermost grey values that is no evidence of clipping
 WHITE_LEVELS = (255, 4095)  # largest grey values of 8 and 12 bits
 HOT_SHARE = 1e-5  # share of hot pixels: ten in an image of 1024 x 1024 px
-MIN_PIXELS = 1000  # pixels that an estimate of noise or correlation needs: its sd is 4 %
+MIN_PIXELS = 1000  # pixels that estimates of noise and correlation need
+MAX_SLOW = 0.9  # largest share of slow changes; beyond it the noise is not visible
 
 
 # Width of the blur of scattered light, relative to the image. Scattered light spreads over some
@@ -103,12 +106,9 @@ def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:
 
 
 def _is_clipped(grey: NDArray[np.floating], outermost: float, neighbour: float) -> bool:
-    """Return whether an outermost grey value is more frequent than its neighbour.
-
-    The numbers have Poisson's distribution.
-    """
-    count, other = (int(np.count_nonzero(grey == value)) for value in (outermost, neighbour))
-    return count - other > SURE * np.sqrt(count + other)
+    """Return whether an outermost grey value is more frequent than its neighbour."""
+    count = int(np.count_nonzero(grey == outermost))
+    return count > max(int(np.count_nonzero(grey == neighbour)), MIN_CLIPPED)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
     chosen = chosen[:: len(chosen) // SAMPLED + 1]
     level = cv2.blur(light, (3, 3)).ravel()[chosen]
     deviation = np.abs(cv2.filter2D(light, cv2.CV_32F, kernel).ravel()[chosen])
-    parts = np.array_split(np.argsort(level), len(chosen) // MIN_PIXELS)
+    parts = np.array_split(np.argsort(level), LEVELS)
     mean = np.array([np.median(level[part]) for part in parts])
     variance = np.array([(1.4826 * np.median(deviation[part])) ** 2 for part in parts])
     variance = np.maximum(variance / _seen_by(SECOND, correlation), MIN_VARIANCE)
@@ -214,9 +214,9 @@ def correlation_of(
             mean = products / pairs / max(mean_square, 1e-300)
             out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = mean
     edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
-    out = np.clip((out - edge) / max(1 - edge, MIN_SEEN), 0, 1)
+    out = np.clip((out - edge) / max(1 - edge, 1 - MAX_SLOW), 0, 1)
     # Correlations of white noise scatter by one over the root of the number of pixels.
-    out[out < SURE / np.sqrt(max(float(weight.sum()), 1.0))] = 0
+    out[out < SURE_CORRELATION / np.sqrt(max(float(weight.sum()), 1.0))] = 0
     out[LAGS, LAGS] = 1
     return out
 

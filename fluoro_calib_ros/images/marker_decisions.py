@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .marker_rays import AGREE, NEAR, MarkerExposure, MarkerRays
+from .marker_rays import AGREE, MarkerExposure, MarkerRays
 from .markers import MarkerFrame, MarkerTracker
 
 
@@ -200,10 +200,10 @@ class EarlierImages:
 
 
 DECIDED = 3  # exposures that agree before an id is confirmed, or disagree before it is dropped
-# Distance from the place that its body predicts, up to which a marker agrees; or NEAR standard
-# deviations, if they are larger.
-NEAR_PX = 1.0
-FAR = 1.5  # factor on that distance, or on AGREE, beyond which the marker is another object
+NEAR_PX = 1.0  # distance from the place that its body predicts, up to which a marker agrees
+NEAR_SIGMAS = 3.5  # the same in standard deviations; the larger one counts
+FAR = 1.5  # factor on that distance, beyond which the marker is another object
+DOUBT_SIGMAS = 4.5  # beyond them it may be one: chance exceeds them in one of 25,000 places
 
 
 class BodyDecisions:
@@ -229,7 +229,7 @@ class BodyDecisions:
         doubtful = exposure.doubtful[view.view]
         distance = np.linalg.norm(seen - place, axis=1)
         scatter = np.hypot(exposure.sigma[view.view], sd)
-        tolerance = np.maximum(NEAR_PX, NEAR * scatter)
+        tolerance = np.maximum(NEAR_PX, NEAR_SIGMAS * scatter)
         agreeing = distance < tolerance
         disagreeing = distance > FAR * tolerance
         # A body that only another view shows has uncertain places along the rays of that view.
@@ -238,7 +238,7 @@ class BodyDecisions:
         disagreeing |= contradicted
         self._seen_right[agreeing] = frame
         view.counts.disagree(disagreeing)
-        strange = np.isfinite(distance) & ~agreeing
+        strange = disagreeing | (distance > np.maximum(NEAR_PX, DOUBT_SIGMAS * scatter))
         view.doubt(np.flatnonzero(strange & ~doubtful), frame)
         suspects = np.flatnonzero(np.isfinite(distance) & (doubtful | (view.counts.wrong > 0)))
         crossed = _crossed(seen, place, tolerance, suspects)
@@ -300,8 +300,9 @@ def _crossed(
     return out
 
 
-DISAGREE = FAR * AGREE  # standardised distance from which two rays are of different markers
+DISAGREE = 6.0  # standardised epipolar distance from which two rays belong to different markers
 DECIDED_ALONE = 8  # exposures that agree before an id is confirmed
+MAX_COST = 50.0  # limit of a squared distance, and evidence from which a decision is made
 
 
 class RayDecisions:
@@ -359,13 +360,14 @@ class RayDecisions:
             if rows in self._evidence:
                 self._kept[rows] = frame + 1
             return []
-        limit = DISAGREE**2  # of a squared distance, and evidence from which a decision is made
-        kept_cost = np.minimum(misfit**2, limit).sum()
-        exchanged_cost = np.minimum(np.nan_to_num(exchanged_misfit, nan=np.inf) ** 2, limit).sum()
+        kept_cost = np.minimum(misfit**2, MAX_COST).sum()
+        exchanged_cost = np.minimum(
+            np.nan_to_num(exchanged_misfit, nan=np.inf) ** 2, MAX_COST
+        ).sum()
         if exchanged_cost < kept_cost or rows not in self._evidence:
             self._kept[rows] = frame
         self._evidence[rows] = self._evidence.get(rows, 0.0) + float(exchanged_cost - kept_cost)
-        if abs(self._evidence[rows]) < limit:
+        if abs(self._evidence[rows]) < MAX_COST:
             return []
         exchanged = self._evidence.pop(rows) < 0
         since = self._kept.pop(rows)

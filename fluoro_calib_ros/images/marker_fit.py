@@ -19,7 +19,6 @@ from scipy.spatial.distance import cdist
 
 from .background import TERMS
 from .fine_grid import Absorbers, FineGrid
-from .imaging import DEPTH
 from .light import Noise
 from .marker_intensity import LightWindows, Shadows
 from .marker_motion import SHADOW_SD_PX, MarkerStates, MeasuredMarkers, Motion, assign
@@ -270,6 +269,7 @@ class _MarkerFit(ShadowFit):
 # Measurement of markers: shadows are assigned to all markers together, fitted and checked.
 
 MAX_MISFIT = 10.0  # largest lack of fit over that of a typical marker
+DEPTH = (0.5, 1.8)  # limits of the depth of a shadow, relative to that of its marker
 
 
 class MarkerMeasurement:

@@ -22,7 +22,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist, squareform
-from scipy.special import chdtri
+from scipy.special import chdtri, erfc
 
 from ..bodies.body import Body, fitted_pose
 from ..correction.fluoroscope_calibration import Calibrations
@@ -36,10 +36,12 @@ from .marker_intensity import (
     first_shadows,
 )
 from .marker_points import ShadowPoints, all_among, shadow_points
-from .marker_rays import AGREE, CHANCE, MIN_SEEN, CalibratedRig
+from .marker_rays import AGREE, CalibratedRig
 from .markers import MIN_MEMBERS, FirstMarkers
-from .matching import CLOSER
 
+CHANCE = float(erfc(AGREE / 2**0.5))  # probability that a right distance does not agree
+MIN_SHARE = 0.6  # least share of the members that are found
+BETTER = 4.0  # factor on the sum of squares up to which another fit of as many members is a rival
 # Expected number of equally good random fits in an exposure: one in a day at 100 exposures/s.
 MAX_CHANCE = 1e-7
 MAX_SHADOWS = 120
@@ -210,7 +212,7 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
     """Find the members of a body among points. Raises DataError."""
     search = _Search(body, points, free)
     search.run()
-    min_count = max(MIN_MEMBERS, int(np.ceil(MIN_SEEN * len(body.target_id))))
+    min_count = max(MIN_MEMBERS, int(np.ceil(MIN_SHARE * len(body.target_id))))
     best = search.best
     if best is None or best.count < min_count:
         count = 0 if best is None else best.count
@@ -224,7 +226,7 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
             f'this exposure, but so may others of {np.count_nonzero(free)} points by chance'
         )
     # If a body fits in more than one way, keep the members on which all ways agree.
-    rivals = [fit.point for fit in search.fits if fit.chi2 < CLOSER**2 * best.chi2]
+    rivals = [fit.point for fit in search.fits if fit.chi2 < BETTER * best.chi2]
     best = best.only((np.array(rivals) == best.point).all(axis=0))
     if best.count < min_count:
         raise DataError(
@@ -360,7 +362,7 @@ def _first(
         chosen = fit.point >= 0
         shadow = points.shadow[fit.point[chosen], view]
         seen = shadow >= 0
-        if np.count_nonzero(seen) < MIN_SEEN * len(shadow):
+        if np.count_nonzero(seen) < MIN_SHARE * len(shadow):
             continue
         rotation, shift = fitted_pose(body.xyz_mm[chosen], points.xyz[fit.point[chosen]])
         members = body.xyz_mm @ rotation.T + shift

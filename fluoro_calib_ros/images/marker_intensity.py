@@ -22,26 +22,26 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
-from .corrector import NOWHERE
 from .detection import (
     BLOB_RADIUS,
-    MIN_SHARE,
     MIN_SIZE,
-    MIN_SNR,
     SCALES,
     field_of_view,
     responses,
 )
 from .imaging import estimate_profile
-from .light import SAMPLED, Light, Noise, estimate_noise, vertex, white_level
-from .marker_motion import AGREE, GIVEN_SD_PX, SHADOW_SD_PX, MarkerStates, Motion, assign
+from .light import Light, Noise, estimate_noise, vertex, white_level
+from .marker_motion import GIVEN_GATE, GIVEN_SD_PX, MarkerStates, Motion, assign
 from .measurement import circles
 from .profile import Profile
 
 MARKER_SCALES = SCALES[:5]  # markers are smaller than beads
 MIN_CONTRAST = 0.02  # least response, as a fraction of the light around it
+MIN_SNR = 4.5  # least response, over the noise of the response
+SHARE = 0.35  # least response of a marker, over that to a typical marker
 BACKGROUND_PX = 6  # half the width of the box whose mean is the light around a pixel
-SAME_PX = AGREE * SHADOW_SD_PX  # distance between maxima below which they are one shadow
+SAMPLED = 4  # step of rows and columns when pixels are subsampled
+SAME_PX = 1.0  # distance between maxima below which they are one shadow
 BORDER = 3  # width of the edge of a window that is not searched, in scales of the blur
 
 
@@ -126,24 +126,18 @@ class FilteredLight:
         row, column = np.divmod(np.flatnonzero(largest), largest.shape[1])
         return row, column
 
-    @property
-    def _part(self) -> tuple[slice, slice]:
-        """Index of about SAMPLED pixels, for medians."""
-        step = max(1, round(np.sqrt(self.light.size / SAMPLED)))
-        return np.s_[::step, ::step]
-
     @cached_property
     def noise(self) -> float:
         """Median of the positive relative responses, from a part of the pixels."""
-        part = self.relative_at(self._part)
+        part = self.relative_at(np.s_[::SAMPLED, ::SAMPLED])
         positive = part[part > 0]
         return float(np.median(positive)) if len(positive) else 0.0
 
     @cached_property
     def usual(self) -> float:
         """Median light in the field, from a part of the pixels."""
-        part = self.light[self._part]
-        field = self.field[self._part]
+        part = self.light[::SAMPLED, ::SAMPLED]
+        field = self.field[::SAMPLED, ::SAMPLED]
         return float(np.median(part[field])) if field.any() else float(self.light.mean())
 
 
@@ -287,7 +281,7 @@ class _Typical:
     def near(cls, light: FilteredLight, uv: NDArray[np.float64]) -> _Typical:
         """Return the median response near points (n, 2)."""
         height, width = light.response.shape
-        around = np.rint(uv).astype(int)[:, None] + _square(int(np.ceil(AGREE * GIVEN_SD_PX)))
+        around = np.rint(uv).astype(int)[:, None] + _square(int(np.ceil(GIVEN_GATE * GIVEN_SD_PX)))
         column = np.clip(around[..., 0], 0, width - 1)
         row = np.clip(around[..., 1], 0, height - 1)
         return cls(light, float(np.median(light.relative_at((row, column)).max(axis=1))))
@@ -340,7 +334,7 @@ def _find_shadows(look: MarkerLook, light: FilteredLight) -> Shadows:
     """Find the shadows of a whole filtered image."""
     row, column = light.maxima
     height, width = light.light.shape
-    strong = light.relative[row, column] > max(MIN_SHARE * look.strength, look.floor)
+    strong = light.relative[row, column] > max(SHARE * look.strength, look.floor)
     inside = (row > 0) & (row < height - 1) & (column > 0) & (column < width - 1)
     rows = np.flatnonzero(strong & inside & look.field[row, column])
     row, column = row[rows], column[rows]
@@ -388,6 +382,9 @@ def _floor(look: MarkerLook, around: NDArray[np.floating]) -> NDArray[np.floatin
     return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
 
 
+MIN_DENSITY = 2e-6  # least density of false shadows [1/px^2]
+
+
 @dataclass(frozen=True)
 class MarkerStart:
     """Properties of the markers in the first image."""
@@ -398,6 +395,9 @@ class MarkerStart:
     noise: Noise
     size: tuple[int, int]  #: width and height of the images [px]
     density: float  #: density of false shadows [1/px^2]
+
+
+NOWHERE_PX = -2e4  # place of markers whose place is not known yet
 
 
 def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarray) -> MarkerStart:
@@ -414,13 +414,13 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         raise DataError(f'marker {outside_id} of the first frame lies outside of the image')
     look, filtered = _learn_look(image, given)
     shadows = _find_shadows(look, filtered)
-    row, column = assign(given, np.full(len(given), GIVEN_SD_PX**2), shadows.uv, AGREE)
+    row, column = assign(given, np.full(len(given), GIVEN_SD_PX**2), shadows.uv, GIVEN_GATE)
     if len(row) < max(1, len(given) // 2):
         raise DataError(
             f'only {len(row)} of {len(given)} markers of the first frame are in the image'
         )
     seen = np.flatnonzero(known)[row]
-    place = np.where(known[:, None], uv, NOWHERE)
+    place = np.where(known[:, None], uv, NOWHERE_PX)
     place[seen] = shadows.uv[column]
     unseen = np.ones(len(uv), dtype=int)
     unseen[seen] = 0
@@ -433,8 +433,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         ),
         noise=estimate_noise(light, look.field),
         size=(width, height),
-        # One more than are seen: an image without them does not exclude them.
-        density=(len(shadows.uv) - len(row) + 1) / max(look.field.sum(), 1),
+        density=max((len(shadows.uv) - len(row)) / max(look.field.sum(), 1), MIN_DENSITY),
     )
 
 

@@ -21,14 +21,14 @@ from scipy.spatial import cKDTree
 
 from .shadow_fit import DEPTH_SD
 
-# Largest standardised deviation of rays, places, or members of a body, that belong together.
-AGREE = 4.0
 FIRST_SPEED_PX = 6.0  # standard deviation of the unknown initial velocity [px/frame]
 FORGET = 0.9  # weight of the past in a running mean
+COMPARED = 5  # images after which it is known how alike two markers move
 UNSTEADY_PX = 0.5  # usual change of a velocity in a frame, or difference of two [px/frame]
-RECENT = 4  # images that show a velocity, or how alike two markers move
 LEADERS = 4  # number of markers whose motion an unseen marker follows
+LED = 0.5  # share of the acceleration that they do not explain
 MAX_SD_PX = 60.0  # largest standard deviation of a prediction
+MODEL_SD_PX = 0.05  # standard deviation of a place in addition to the noise of the measurement
 SHADOW_SD_PX = 0.25  # standard deviation of the place of a shadow before the fit
 GIVEN_SD_PX = 1.5  # standard deviation of a place that is given, or predicted from neighbours
 FAR = 1e6  # cost of an assignment outside the gate, and place without a measurement
@@ -81,7 +81,7 @@ class Motion:
         pooled = float(np.median(self.squared)) if len(self.squared) else 0.0
         q = np.maximum(self.squared, pooled)
         if led is not None:
-            q = np.where(led, pooled, q)
+            q = np.where(led, LED**2 * pooled, q)
         p = self.covariance
         cross = p[:, 0, 1] + t * p[:, 1, 1]
         p[:, 0, 0] += t * (p[:, 0, 1] + cross) + q * t**4 / 4
@@ -96,7 +96,7 @@ class Motion:
         self, sigma: NDArray[np.float64], rows: NDArray[np.int64] | slice = np.s_[:]
     ) -> NDArray[np.float64]:
         """Return variances (n,) of measured minus predicted coordinates of some markers."""
-        return self.variance[rows] + sigma**2
+        return self.variance[rows] + sigma**2 + MODEL_SD_PX**2
 
     def update(
         self,
@@ -167,7 +167,7 @@ class Motion:
         if len(rows) <= LEADERS:
             return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, 2))
         pairs = np.ix_(rows, rows)
-        unlike = np.where(self.together[pairs] < RECENT, np.inf, self.unlike[pairs])
+        unlike = np.where(self.together[pairs] < COMPARED, np.inf, self.unlike[pairs])
         order = np.argsort(unlike, axis=1, kind='stable')[:, :LEADERS]
         usual = np.take_along_axis(unlike, order, axis=1).mean(axis=1)
         company_velocity = np.median(self.velocity[rows][order], axis=1)
@@ -302,7 +302,9 @@ def doubtful_pairs(
 
 # States of markers between images: motion, depth of the shadow, number of images unseen.
 
+GIVEN_GATE = 3.0  # largest distance of a marker from a given place [standard deviations]
 KNOWN_DEPTH_SD = 0.15  # standard deviation of the depth of a measured marker
+RECENT = 4  # images within which two given places determine the velocity
 
 
 @dataclass(frozen=True)
@@ -365,7 +367,7 @@ class MarkerStates:
         """
         motion = self.motion
         squared = ((uv - motion.uv[rows]) ** 2).sum(axis=1)
-        is_expected = squared < AGREE**2 * (motion.variance[rows] + GIVEN_SD_PX**2)
+        is_expected = squared < GIVEN_GATE**2 * (motion.variance[rows] + GIVEN_SD_PX**2)
         is_moved = ~is_expected | (self.unseen[rows] > 1) | (self.placed[rows] < RECENT)
         rows, uv = rows[is_moved], uv[is_moved]
         is_repeated = is_expected[is_moved] & (self.placed[rows] < RECENT)

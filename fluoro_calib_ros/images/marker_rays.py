@@ -10,7 +10,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc
 
 from ..bodies.body import Body, by_pose
 from ..bodies.motion import POSE
@@ -26,11 +25,9 @@ from ..reconstruction.intersection import (
 )
 from ..reconstruction.reconstruct import IntersectedViews, MatchedViews
 from .corrector import observed_pixels
-from .marker_motion import AGREE
 from .markers import MarkerFrame
 
-CHANCE = float(erfc(AGREE / 2**0.5))  # probability that chance exceeds AGREE
-NEAR = float(np.sqrt(-2 * np.log(CHANCE)))  # the same for a distance in an image (Rayleigh)
+AGREE = 4.0  # largest standardised deviation of rays, or members of a body, that belong together
 SYSTEMATIC_PX = 0.1  # standard deviation of a corrected image point in addition to its own
 
 
@@ -265,8 +262,8 @@ class RayFit:
 
 RIGID_MM = 0.1  # standard deviation of the motion of a marker in its body
 MIN_MEMBERS = 3  # members of a body that determine its pose
-# Share of the markers of a body that must be found, or seen again. With fewer, the body has moved
-# elsewhere, and the measured shadows may be anything.
+# Share of the markers of a body that must be seen again. With fewer, the body has moved elsewhere,
+# and the measured shadows may be anything.
 MIN_SEEN = 0.5
 LEARNED = 40  # exposures from which the shape of a body is learned
 FRAME_NS = 10_000_000  # nominal time of an exposure for the filter, which adapts to any

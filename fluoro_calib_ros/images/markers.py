@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..findings import Finding, Kind
 from ..options import option, validate_options
-from .corrector import NOWHERE
 from .marker_fit import MarkerMeasurement
 from .marker_intensity import (
+    NOWHERE_PX,
     FilteredImage,
     LightWindows,
     MarkerLook,
@@ -456,7 +456,7 @@ class MarkerTracker:
         if followed is not None:
             doubtful = followed.doubts.doubtful
             uv = followed.states.motion.uv
-            predicted = np.where(uv > NOWHERE / 2, uv, np.nan)
+            predicted = np.where(uv > NOWHERE_PX / 2, uv, np.nan)
             lost = followed.search.lost(followed.states)
         return MarkerFrame(
             self._frame,

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from ..findings import Finding, Kind
 from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.rotations import matrix_from_vector
-from .shadow_fit import ROBUST
 
 # Prior standard deviations of the coefficients by degree, as displacements at the border of the
 # image relative to half its width. Pincushion has degree 3; image intensifiers reach about 6 %.
 PRIOR_SD = (0.01, 0.012, 0.03, 0.008, 0.008, 0.003)
 DEGREE = len(PRIOR_SD)
+TAIL = 2.5  # residual at which the weight is halved [robust standard deviations]
 POSE = 7  # unknowns before the coefficients: position, rotation, log of the principal distance
 DAMPING = 1e-6  # relative increase of the diagonal of the normal matrix
 CONTOUR = 12  # points on the border of a shadow
@@ -224,7 +224,7 @@ def fit_view(
             return view, np.inf
         squared = np.sum(residual**2, axis=1)
         scale = max(float(np.sqrt(np.median(squared) / (2 * np.log(2)))), floor_px)
-        weight = 1 / (1 + squared / (ROBUST * scale) ** 2)
+        weight = 1 / (1 + squared / (TAIL * scale) ** 2)
         rows = jacobian[valid].reshape(-1, jacobian.shape[2])
         weighted = rows * np.repeat(weight / scale**2, 2)[:, None]
         deviation = np.concatenate(
@@ -288,9 +288,11 @@ def _moved(view: View, step: NDArray[np.float64]) -> View:
 # laboratories are three to five times as far from the source as they are wide.
 USUAL_DISTANCE = 4.0
 USUAL_SD = 0.25  # relative standard deviation of that distance
+SHARED_SD = 0.03  # the same, once other images of the fluoroscope are solved
+SHARED_CERTAINTY = 0.3  # factor on the standard deviations of the coefficients then
 # Images in which beads were seen, and may be matched with the distortion of the other images.
 NOT_FOUND = (Kind.NO_POSE, Kind.POSE_UNSURE, Kind.POSE_AMBIGUOUS, Kind.BEADS_NOT_MEASURED)
-MIN_SHARED = 3  # solved images that are needed to share their distortion: one may be wrong
+MIN_SHARED = 3  # solved images that are needed to share their distortion
 
 
 def assumed_lens(image_size: tuple[int, int], principal_distance_px: float | None) -> Lens:
@@ -301,18 +303,15 @@ def assumed_lens(image_size: tuple[int, int], principal_distance_px: float | Non
 
 
 def shared_lens(lens: Lens, views: Sequence[View]) -> Lens | None:
-    """Return the lens with the distortion of the solved views, None if there are too few.
-
-    Their mean is known as well as if they were independent draws from the prior.
-    """
+    """Return the lens with the distortion of the solved views, None if there are too few."""
     if len(views) < MIN_SHARED:
         return None
     return replace(
         lens,
         principal_distance_px=float(np.median([view.principal_distance_px for view in views])),
-        principal_distance_sd=lens.principal_distance_sd / np.sqrt(len(views)),
+        principal_distance_sd=SHARED_SD,
         coefficients=np.median([view.coefficients for view in views], axis=0),
-        certainty=lens.certainty / np.sqrt(len(views)),
+        certainty=SHARED_CERTAINTY,
     )
 
 

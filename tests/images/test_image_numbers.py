@@ -24,6 +24,7 @@ from fluoro_calib_ros.images.lattice import _basis
 from fluoro_calib_ros.images.marker_motion import (
     FIRST_SPEED_PX,
     MAX_SD_PX,
+    MODEL_SD_PX,
     UNSTEADY_PX,
     MarkerStates,
     MeasuredMarkers,
@@ -408,7 +409,7 @@ def test_marker_that_leaves_its_body_is_strange():
     np.testing.assert_allclose(ratio[rows != 3], usual[rows != 3], atol=1e-12)
     assert not len(one.strangeness(np.arange(12) < 4)[0])
     # Markers that were compared in too few images are not judged.
-    one.together[:] = 3
+    one.together[:] = 4
     assert (one.strangeness(np.ones(12, bool))[1] == 0).all()
 
 
@@ -420,7 +421,7 @@ def test_places_are_taken_in_as_by_a_kalman_filter():
     one.update(np.array([1]), uv, np.array([0.4]), 2)
     h = np.array([[1.0, 0.0]])
     p = np.array([[2.0, 0.3], [0.3, 0.5]])
-    noise = 0.4**2
+    noise = 0.4**2 + MODEL_SD_PX**2
     gain = p @ h.T / (h @ p @ h.T + noise)
     expected = before[1] + gain @ (uv - before[1, :1])
     np.testing.assert_allclose(np.stack([one.uv[1], one.velocity[1]]), expected)

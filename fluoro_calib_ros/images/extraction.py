@@ -12,19 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import chndtr
-from scipy.stats import theilslopes
 from threadpoolctl import ThreadpoolController
 
 from ..errors import DataError
 from ..findings import Finding, Kind
-from .background import MIN_DIRECT
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
-from .growth import LAST_TOLERANCE_PX, MIN_SHARE, Match, Seen, nearby_residuals, supported
+from .growth import Match, Seen, nearby_residuals, supported
 from .imaging import Expected, Imaging, first_imaging
-from .matching import MIN_BEADS, PhantomModel, match
+from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, measure_beads
-from .shadow_fit import MAX_SIGMA_PX, UNDISTURBED, Beads
+from .shadow_fit import MAX_SIGMA_PX, Beads
 from .view import Lens, View, fit_view
 
 # Accepted share of wrong centres among those with the largest standard deviation. A centre is
@@ -33,8 +31,17 @@ WRONG_SHARE = 1e-3
 WRONG_SIGMAS = np.sqrt(-2 * np.log(WRONG_SHARE))
 SURE_SIGMA_PX = 0.5 / WRONG_SIGMAS
 MAX_SIGMAS = 2.9  # largest standard deviation over the usual one: an eighth of the weight
+MAX_MISFIT = 5.0  # largest lack of fit, relative to that of a typical bead
 DEPTH = (0.55, 1.7)  # depth of a shadow relative to the usual depth in such light
 RADII = (0.2, 5.0)  # radii of shadows of equal beads, relative to a typical one
+MIN_CONTRASTS = 20  # least number of beads from which the usual depth is estimated
+CONTRAST_STEPS = 8
+MIN_USUAL_DEPTH = 0.1
+RESIDUAL_SIGMAS = 4.5  # largest residual from the prediction by neighbours [standard deviations]
+FIRST_RESIDUAL_PX = 2.5
+ALONE_RADII = 2.5  # least distance of an isolated bead from the next shadow [radii]
+MIN_ACCEPTED = 0.5  # least share of the matched beads that are measured well
+MIN_SCATTER_PX = 0.05
 # Share of the shifts of shadows by distortion within them that remains after the correction: 0.46,
 # 0.57 and 0.63 with shadows of 17 px (`benchmarks.calibrated_renderings`, large beads).
 BENT_LEFT = 0.55
@@ -204,7 +211,7 @@ def _measured(
         reasons = _reasons(beads, predicted[rows])
         reasons = [reason if known else HIDDEN for reason, known in zip(reasons, sized)]
         good = np.array([reason is None for reason in reasons], dtype=bool)
-        if np.count_nonzero(good) < max(4, MIN_SHARE * len(matched.bead)):
+        if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(matched.bead)):
             measured_well = int(np.count_nonzero(good))
             raise DataError(
                 f'the phantom is found with {len(matched.bead)} beads, of which only '
@@ -264,11 +271,9 @@ def _away(measured: _Measured) -> NDArray[np.bool_]:
     """Return (n,) whether well-measured beads are off the places predicted by their neighbours."""
     good = np.array([reason is None for reason in measured.reasons], dtype=bool)
     sigma = measured.beads.sigma[good]
-    scatter = measured.sd_px[good]
+    scatter = np.maximum(measured.sd_px[good], MIN_SCATTER_PX)
     residual = measured.residual[good]
-    # One image in 1 / WRONG_SHARE loses a bead by chance: the lengths have Rayleigh's distribution.
-    limit = np.sqrt(-2 * np.log(WRONG_SHARE / max(len(residual), 1)))
-    near = residual < limit * np.hypot(scatter, sigma)
+    near = residual < RESIDUAL_SIGMAS * np.hypot(scatter, sigma)
     away = np.zeros(len(good), dtype=bool)
     away[good] = ~near | (_chances_of_wrong(residual, sigma, scatter) > WRONG_SHARE)
     return away
@@ -373,7 +378,7 @@ def _expected(
     apart = np.full(len(predicted), np.inf)
     if len(rows) > 1:
         apart[rows] = cKDTree(predicted[rows]).query(predicted[rows], k=[2])[0][:, 0]
-    alone = apart > 2 * seen.radius_px
+    alone = apart > ALONE_RADII * seen.radius_px
     start[bead[alone[bead]]] = uv[alone[bead]]
     size = np.sqrt(np.abs(np.linalg.det(outlines)))
     typical = float(np.median(size))
@@ -394,15 +399,22 @@ def _usual_depth(beads: Beads) -> NDArray[np.float64]:
 
     Beads absorb the same share of the direct light, and no scattered light; a hole of a sheet adds
     a share of the light behind the sheet. A contrast is therefore linear in the light around the
-    bead: a robust line through all of them (Theil and Sen, by scipy).
+    bead. The line is fitted by iteratively reweighted least squares with Cauchy weights.
     """
     good = beads.measured & (beads.light > 0)
     usual = np.ones(len(beads.uv))
-    if np.count_nonzero(good) < MIN_BEADS:
+    if np.count_nonzero(good) < MIN_CONTRASTS:
         return usual
-    light = beads.light[good]
-    slope, level, *_ = theilslopes(beads.depth[good] * light, light, method='joint')
-    usual[good] = np.maximum(slope + level / light, MIN_DIRECT)
+    light = beads.light / float(np.median(beads.light[good]))
+    rows = np.column_stack([light, np.ones_like(light)])[good]
+    contrast = (beads.depth * light)[good]
+    line = np.array([float(np.median(beads.depth[good])), 0.0])
+    for _ in range(CONTRAST_STEPS):
+        residual = contrast - rows @ line
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+        weight = 1 / np.sqrt(1 + (residual / scale) ** 2)
+        line = np.linalg.lstsq(rows * weight[:, None], contrast * weight, rcond=None)[0]
+    usual[good] = np.maximum(line[0] + line[1] / light[good], MIN_USUAL_DEPTH)
     return usual
 
 
@@ -420,11 +432,11 @@ def _reasons(beads: Beads, predicted: NDArray[np.float64]) -> list[Finding | Non
         elif not DEPTH[0] < depth < DEPTH[1]:
             cause = f'a contrast of {depth:.0%} of that of a bead'
             reason = Finding(Kind.BEAD_CONTRAST, cause, numbers={'depth': depth})
-        elif beads.misfit[number] > UNDISTURBED:
+        elif beads.misfit[number] > MAX_MISFIT:
             reason = DISTURBED
         elif beads.sigma[number] > MAX_SIGMA_PX:
             reason = HIDDEN
-        elif off > LAST_TOLERANCE_PX:
+        elif off > FIRST_RESIDUAL_PX:
             cause = f'{off:.1f} px from its prediction'
             reason = Finding(Kind.BEAD_AWAY, cause, numbers={'off_px': off})
         out.append(reason)

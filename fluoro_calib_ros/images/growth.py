@@ -12,15 +12,22 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .pose_search import LocalPose
-from .view import DEGREE, TAIL, Lens, View, fit_view
+from .view import TAIL, Lens, View, fit_view
 
+START_BEADS = 14  # beads within the initial radius
 GROWTH = 1.25  # factor on the radius in each step
 MIN_SHARE = 0.5  # least share of expected beads; a pose with less is discarded
+DEGREE = 5
+LAST_DEGREE = 6
 LAST_STEPS = 4
-LAST_TOLERANCE_PX = 2.5  # largest distance of a bead from its prediction by the final view
-# Neighbours of a bead: those within the initial radius, those that support it, and those from
-# which its residual is interpolated; they screen it from those farther away.
-NEIGHBOURS = 8
+LAST_TOLERANCE_PX = 2.5
+CELLS = 5  # regions along each side of the image
+MIN_CELL = 5  # least number of predicted beads in a region that is evaluated
+AMBIGUOUS_PX = 1.5  # least difference of a detection's distances from the two nearest predictions
+SUPPORT = 12  # neighbours in space, of which MIN_SHARE must be found as well
+# Correlation length of the residuals of a view, as a share of half the image: a polynomial of
+# degree 6 has five extrema across it.
+LENGTH = 0.5
 
 
 @dataclass(frozen=True)
@@ -95,6 +102,7 @@ def start_view(pose: LocalPose, lens: Lens, xyz: NDArray[np.float64]) -> View:
         position=xyz[pose.bead] - rotation.T @ sensor,
         principal_distance_px=c,
         coefficients=lens.expected(DEGREE),
+        degree=DEGREE,
     )
 
 
@@ -114,7 +122,7 @@ def grow(view: View, start: int, xyz: NDArray[np.float64], seen: Seen) -> Match 
     the row of the bead in xyz (n, 3) [mm].
     """
     distance = np.linalg.norm(xyz - xyz[start], axis=1)
-    radius = float(np.sort(distance)[: NEIGHBOURS + 1].max())
+    radius = float(np.partition(distance, min(START_BEADS, len(xyz) - 1))[:START_BEADS].max())
     farthest = float(distance.max())
     while True:
         for _ in range(2):
@@ -136,6 +144,7 @@ def grow(view: View, start: int, xyz: NDArray[np.float64], seen: Seen) -> Match 
 
 def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
     """Match all beads with a view that is nearly right, and refine it."""
+    view = view.with_degree(max(view.degree, LAST_DEGREE))
     tolerance = seen.tolerance_px
     scale = 0.0
     bead = detection = np.zeros(0, dtype=int)
@@ -184,8 +193,7 @@ def nearby_residuals(
     xyz (n, 3) are all beads, bead (m,) the matched rows with pixels uv (m, 2).
     """
     place = view.project(xyz)
-    # What a polynomial leaves is no smoother than its extrema are apart.
-    return interpolated(place, bead, uv - place[bead], 2 * view.lens.half_px / (DEGREE - 1))
+    return interpolated(place, bead, uv - place[bead], LENGTH * view.lens.half_px)
 
 
 def _judged(
@@ -208,13 +216,14 @@ def _judged(
     prediction_distance, _ = cKDTree(predicted[row]).query(
         seen.uv, distance_upper_bound=max(tolerance, 1.2 * seen.radius_px)
     )
+    good = _good_cells(predicted[row], is_found, seen.field.shape)
     # A detection between two predictions may belong to either.
     tree = cKDTree(predicted[row])
     distance, _ = tree.query(seen.uv[detection], k=2)
-    is_unique = distance[:, 1] > distance[:, 0] + TAIL * scale
+    is_unique = distance[:, 1] > distance[:, 0] + AMBIGUOUS_PX
     matched = np.zeros(len(row), dtype=bool)
     matched[bead[is_unique]] = True
-    good = supported(xyz[row], matched) & supported(predicted[row], is_found)
+    good &= supported(xyz[row], matched)
     accepted = good[bead] & is_unique
     return Match(
         view,
@@ -229,17 +238,30 @@ def _judged(
 
 
 def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (n,) whether most neighbours of beads (n, k) in space or image are good (n,).
+    """Return (n,) whether most neighbours in space of beads (n, 3) are good (n,).
 
-    If a face is seen from its edge, or a view has diverged, a prediction that is off by one bead
-    still finds a detection now and then.
+    If a face is seen from its edge, a prediction that is off by one bead still finds a detection
+    now and then.
     """
-    count = min(NEIGHBOURS + 1, len(xyz))
+    count = min(SUPPORT + 1, len(xyz))
     _, near = cKDTree(xyz).query(xyz, k=count)
     near = near.reshape(len(xyz), -1)
     is_other = near != np.arange(len(xyz))[:, None]
     share = np.sum(good[near] & is_other, axis=1) / np.maximum(is_other.sum(axis=1), 1)
     return np.asarray(share >= MIN_SHARE)
+
+
+def _good_cells(
+    uv: NDArray[np.float64], detected: NDArray[np.bool_], shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """Return (n,) whether most predicted beads (n, 2) of the same region are found."""
+    height, width = shape
+    cell = (np.clip(uv / (width, height), 0, 0.999) * CELLS).astype(int)
+    number = cell[:, 0] * CELLS + cell[:, 1]
+    total = np.bincount(number, minlength=CELLS * CELLS)
+    hits = np.bincount(number, weights=detected, minlength=CELLS * CELLS)
+    bad_cell = (total >= MIN_CELL) & (hits < 0.6 * total)
+    return ~bad_cell[number]
 
 
 # Interpolation of the residuals of matched beads over an image.
@@ -249,9 +271,11 @@ def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.b
 # smooth, and errors of centres and survey add noise. The share of the noise, and the size of both,
 # are estimated from how well matched beads predict each other.
 
+NEIGHBOURS = 8  # number of neighbours; they screen a bead from those farther away
 NOISE_SHARES = (0.001, 0.01, 0.1, 1.0)  # variance of the noise over that of the smooth part
 SAMPLE = 100  # beads from which the share is estimated
 ROUNDS = 2  # iterations of the weights: the first also spoils those of an outlier's neighbours
+FAR = 1e9  # place of beads without a pixel, far from all others [px]
 
 
 @dataclass(frozen=True)
@@ -273,8 +297,7 @@ def interpolated(
     A bead does not contribute to its own value, and an outlier has less weight for others.
     length_px: distance at which the covariance of the smooth part has fallen to a half.
     """
-    far_away = 1 / np.finfo(float).eps  # beads without a pixel
-    kriging = _Kriging.of(np.nan_to_num(place, nan=far_away) / length_px, bead)
+    kriging = _Kriging.of(np.where(np.isfinite(place), place, FAR) / length_px, bead)
     matched = kriging.chosen(bead)
     sample = np.arange(0, len(bead), max(1, len(bead) // SAMPLE))
     share = _noise_share(matched.chosen(sample), residual, sample)

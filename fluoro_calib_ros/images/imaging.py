@@ -23,13 +23,19 @@ from .measurement import FIRST_STEPS, RADIUS_SD, STEPS, BeadFit, rounded, scatte
 from .profile import LIMITS, MASKED, PLAIN, SHAPE, Profile, fit_profile
 from .shadow_fit import DISTURBED, ShadowFit
 
-SAMPLE = 100  # largest number of beads of which a profile, or what they have in common, is found
+PROFILE_STEPS = 3
+PROFILE_BEADS = 100  # largest number of beads for the profile
 # Rounds without a better fit, after which the best profile is chosen in windows of equal size: a
 # hard edge with a wide blur looks like a sphere. If the radius grows by a half, fits get worse
 # before they get better.
 PATIENCE = 4
 PROFILE_ROUNDS = 30  # largest number of rounds; 4 to 10 were needed
 MOST = 2.0  # largest factor between the radius of a bead and that of its detection
+START_BLUR_PX = 0.9
+START_ATTENUATION = 1.5
+START_SCATTER = 0.1
+START_SHARPENING = 1.0
+START_MASK_PX = 3.0
 # Common share of the lack of fit from which an unsharp mask is searched for. It was .21 to .43 in
 # four images with a mask of factor 1.5 and 3 px, and at most .15 in 41 images without one but in
 # one, whose profile was not the best.
@@ -38,6 +44,7 @@ COMMON = 0.15
 # at most 0.0004 in three images where bright borders of a mask were clipped, and 0.56 to 0.64 in
 # six images with a clipped background.
 CLIPPED = 0.01
+MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image
 # Largest lack of fit with a mask over that without one. It was .43 to .88 in seven images with a
 # mask whose parameters were found, and .98 in one where they were not.
 BETTER = 0.9
@@ -46,12 +53,15 @@ STEP = 1.25  # ratio of consecutive sizes in the first comparison
 SIZES = STEP ** np.arange(-4, 5)
 FINER_STEPS = (STEP**0.5, STEP**0.25, STEP**0.125)  # ratios of sizes in the refinements
 FEW = 5  # isolated beads below which overlapping beads are used for the profile as well
+SAMPLE = 40  # beads that decide whether sizes differ
 OTHERS = 0.2  # largest share of beads in the sample with another object next to them
 ROUNDS = 2  # the second round uses a profile of beads of one size
 # Standard deviation of the share of scattered light from isolated shadows, which hardly separate
 # it from attenuation: in renderings with a share of 0.1, it was 0.06 to 0.31.
 SCATTER_SD = 0.1
 SCATTER_ROUNDS = 3  # windows of overlapping shadows with a large lack of fit are used later
+SCATTER_MARGIN = 0.1  # of windows, in which different profiles are compared
+SCATTER_STEP = 0.01  # change of the light behind two beads below the noise of a pixel
 
 
 def estimate_profile(
@@ -71,10 +81,10 @@ def estimate_profile(
     """
     is_known = start is not None and 'scatter' not in estimated
     distance = cKDTree(uv).query(uv, k=[2])[0][:, 0] if len(uv) > 1 else np.full(1, np.inf)
-    alone = np.argsort(-distance, kind='stable')[:SAMPLE]
+    alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
     place = uv[alone]
     shapes = shape[alone], None if size is None else size[alone]
-    start = start or Profile(radius_px, _middle('blur_px'), _middle('attenuation'), SCATTER_SD)
+    start = start or Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)
     profiles = [start]
     lacks: list[float] = []
     while len(lacks) < PROFILE_ROUNDS and len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
@@ -95,12 +105,6 @@ def estimate_profile(
     estimates = [start, profiles[-1]] if is_known else profiles[1:] or profiles
     fits = [_profile_fit(light, uv[alone], shapes, profile, reach_px) for profile in estimates]
     return min(fits, key=ShadowFit.typical).profile
-
-
-def _middle(name: str) -> float:
-    """Return the initial value of a parameter of a profile: the middle of its bounds."""
-    low, high = LIMITS[name]
-    return float(np.sqrt(low * high)) if low else (low + high) / 2
 
 
 def _settled(profile: Profile, before: Profile, estimated: Sequence[str]) -> bool:
@@ -128,7 +132,7 @@ def _profile_fit(
     shape, size = shapes
     fit = BeadFit(light, uv, shape, profile=profile, noise=noise, size=size, reach_px=reach_px)
     fit.background.plane_only = True
-    fit.run(FIRST_STEPS)
+    fit.run(PROFILE_STEPS)
     return fit
 
 
@@ -212,9 +216,9 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     """
     size = imaging.size[shadows.row]
     start = replace(
-        imaging.profile.with_scatter(SCATTER_SD),
-        sharpening=_middle('sharpening'),
-        mask_px=_middle('mask_px'),
+        imaging.profile.with_scatter(START_SCATTER),
+        sharpening=START_SHARPENING,
+        mask_px=START_MASK_PX,
     )
     distance = _distance(shadows)
     close = distance < 2 * imaging.profile.reach_px
@@ -234,6 +238,8 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         profile = _typical(
             light, isolated, imaging.size, start.radius_px, start=profile, estimated=estimated
         )
+    if profile.sharpening < MIN_SHARPENING:
+        profile = replace(profile, sharpening=0.0, mask_px=0.0)
     plain, masked = (
         _profile_fit(light, shadows.uv[rows], shapes, one, profile.reach_px).typical()
         for one in (imaging.profile, profile)
@@ -247,12 +253,12 @@ def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     Without isolated shadows, or if the model does not fit them, the share stays as it is.
     """
     size = imaging.size[shadows.row]
-    overlapping = _sampled(_overlapping(shadows, size, imaging.profile.radius_px), SAMPLE)
+    overlapping = _sampled(_overlapping(shadows, size, imaging.profile.radius_px), PROFILE_BEADS)
     alone = np.flatnonzero(shadows.seen & shadows.alone & np.isfinite(size))
     if not (len(overlapping) and len(alone)):
         return imaging
     rows = np.concatenate([overlapping, _sampled(alone, SAMPLE)])
-    reach_px = size[rows].max() * imaging.profile.reach_px
+    reach_px = (1 + SCATTER_MARGIN) * size[rows].max() * imaging.profile.reach_px
 
     def fitted(imaging: Imaging) -> tuple[BeadFit, NDArray[np.float64]]:
         fit = _Sizes(light, shadows, imaging).fitted(rows, size[rows], STEPS - 1, (reach_px,) * 2)
@@ -269,7 +275,7 @@ def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         step = (right + weight * (first - before.scatter)) / (information + weight)
         scatter = float(np.clip(before.scatter + step, *LIMITS['scatter']))
         known = before.with_scatter(scatter)
-        if abs(known.scatter - before.scatter) < RADIUS_SD:  # lost in that of the shape
+        if abs(known.scatter - before.scatter) < SCATTER_STEP:
             break
         profile = _typical(
             light, shadows, imaging.size, before.radius_px, start=known, estimated=SHAPE

@@ -25,15 +25,16 @@ from scipy.spatial import cKDTree
 
 from ..findings import Finding, Kind, Severity
 from .growth import MIN_SHARE, Match, Seen, settle
-from .view import DEGREE, Lens, View, fit_view
+from .view import Lens, View, fit_view
 
 FLAT = 0.02  # largest thickness over the extent of a flat phantom
 REACH = 0.3  # largest distance of a bead from its place, over the distance between neighbours
 MIN_ANGLE = np.deg2rad(35.0)  # least angle between the steps of a lattice, also in an oblique view
 CENTRAL = 8  # number of beads in the middle from which a search starts
-MIN_NUMBERED = 0.6  # share of the beads to be numbered; a step that is too long reaches half
+MIN_NUMBERED = 0.6  # share of the beads that a numbering must reach
 GAP = 2  # half the width of the largest gap, in missing beads
 SHIFTS = 6  # number of best shifts for each basis
+DEGREE = 3  # degree of the distortion during the refinement of a candidate
 STEPS = 3  # number of steps of the refinement
 
 # Note on images of a grid of which any place is accepted.
@@ -299,6 +300,7 @@ def _view(
             position=position,
             principal_distance_px=c,
             coefficients=lens.expected(DEGREE),
+            degree=DEGREE,
         )
         if (view.depth(xyz) <= 0).any():
             continue

@@ -23,7 +23,7 @@ from ..errors import DataError
 from ..findings import Kind
 from ..photogrammetry.rotations import rotation_angle
 from .growth import LAST_TOLERANCE_PX, Match, Seen, grow, settle, start_view
-from .lattice import CENTRAL, REACH, SHIFTS, STEPS, FlatGrid, GridPose, grid_poses
+from .lattice import CENTRAL, REACH, STEPS, FlatGrid, GridPose, grid_poses
 from .pose_search import (
     MIN_EXPLAINED,
     MIN_FOUND,
@@ -68,6 +68,7 @@ SIZE_NEIGHBOURS = 12  # neighbours from which the usual response is estimated
 SIZE_SLOPES = (0.5, 3.0)
 CLOSER = 2.0  # ratio of the residuals of two poses that decides between them
 SYMMETRY_SHARE = 0.4  # least share of the beads that a symmetry moves close to a bead
+SHIFTS = 6  # number of shifts to neighbours that are candidates of symmetries
 SCALE_BY_SIZE = (0.55, 1.6)  # ratio of a bead's image to its diameter, with the blur
 
 

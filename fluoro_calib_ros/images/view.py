@@ -24,8 +24,7 @@ from ..photogrammetry.rotations import matrix_from_vector
 
 # Prior standard deviations of the coefficients by degree, as displacements at the border of the
 # image relative to half its width. Pincushion has degree 3; image intensifiers reach about 6 %.
-PRIOR_SD = (0.01, 0.012, 0.03, 0.008, 0.008, 0.003)
-DEGREE = len(PRIOR_SD)
+PRIOR_SD = (0.01, 0.012, 0.03, 0.008, 0.008, 0.003, 0.003)
 TAIL = 2.5  # residual at which the weight is halved [robust standard deviations]
 POSE = 7  # unknowns before the coefficients: position, rotation, log of the principal distance
 DAMPING = 1e-6  # relative increase of the diagonal of the normal matrix
@@ -38,8 +37,7 @@ class Lens:
 
     image_size: tuple[int, int]  #: width and height [px]
     principal_distance_px: float
-    #: relative standard deviation; by default that of a principal distance that is given
-    principal_distance_sd: float = 0.08
+    principal_distance_sd: float = 0.08  #: relative standard deviation
     #: (2, k), expected coefficients [px], of any degree; empty for zero
     coefficients: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 0)))
     certainty: float = 1.0  #: factor on the prior standard deviations of the coefficients
@@ -76,7 +74,7 @@ class View:
     position: NDArray[np.float64]  #: (3,), source in the frame of the phantom [mm]
     principal_distance_px: float
     coefficients: NDArray[np.float64]  #: (2, k), coefficients of the polynomial [px]
-    degree: int = DEGREE
+    degree: int
 
     @property
     def interior(self) -> NDArray[np.float64]:
@@ -288,6 +286,7 @@ def _moved(view: View, step: NDArray[np.float64]) -> View:
 # laboratories are three to five times as far from the source as they are wide.
 USUAL_DISTANCE = 4.0
 USUAL_SD = 0.25  # relative standard deviation of that distance
+GIVEN_SD = 0.08  # relative standard deviation of a given principal distance
 SHARED_SD = 0.03  # the same, once other images of the fluoroscope are solved
 SHARED_CERTAINTY = 0.3  # factor on the standard deviations of the coefficients then
 # Images in which beads were seen, and may be matched with the distortion of the other images.
@@ -298,7 +297,7 @@ MIN_SHARED = 3  # solved images that are needed to share their distortion
 def assumed_lens(image_size: tuple[int, int], principal_distance_px: float | None) -> Lens:
     """Return the lens assumed before the first image; a principal distance of None is unknown."""
     if principal_distance_px is not None:
-        return Lens(image_size, principal_distance_px)
+        return Lens(image_size, principal_distance_px, GIVEN_SD)
     return Lens(image_size, USUAL_DISTANCE * max(image_size), USUAL_SD)
 
 

@@ -16,6 +16,7 @@ from fluoro_calib_ros.images import extraction
 from fluoro_calib_ros.images.growth import (
     Match,
     Seen,
+    _good_cells,
     _turn_to,
     pairs,
     supported,
@@ -128,6 +129,12 @@ def test_beads_are_supported_by_most_of_their_neighbours():
     assert not supported(xyz, alone)[20]
 
 
+def test_regions_with_few_beads_found_are_bad():
+    uv = np.array([[5.0, 5]] * 5 + [[95.0, 5]] * 5 + [[5.0, 55]] * 4 + [[95, 55]] * 5)
+    found = np.array([1, 1, 1, 0, 0] + [1, 1, 0, 0, 0] + [0] * 4 + [1] * 5, bool)
+    assert _good_cells(uv, found, (60, 100)).tolist() == [True] * 5 + [False] * 5 + [True] * 9
+
+
 def test_steps_of_a_lattice_are_the_shortest_two_across():
     grid = np.stack(np.meshgrid(np.arange(5) * 3.0, np.arange(5) * 4.0), -1).reshape(-1, 2)
     tree = seen(grid).tree
@@ -154,12 +161,7 @@ def beads(**changes):
 @pytest.mark.parametrize(
     ('name', 'good', 'bad', 'kind'),
     [
-        (
-            'misfit',
-            extraction.UNDISTURBED,
-            1.01 * extraction.UNDISTURBED,
-            extraction.DISTURBED.kind,
-        ),
+        ('misfit', extraction.MAX_MISFIT, 1.01 * extraction.MAX_MISFIT, extraction.DISTURBED.kind),
         ('sigma', extraction.MAX_SIGMA_PX, 1.01 * extraction.MAX_SIGMA_PX, extraction.HIDDEN.kind),
         ('depth', 1.01 * extraction.DEPTH[0], extraction.DEPTH[0], Kind.BEAD_CONTRAST),
         ('depth', 0.99 * extraction.DEPTH[1], extraction.DEPTH[1], Kind.BEAD_CONTRAST),
@@ -174,7 +176,7 @@ def test_bead_is_refused_at_its_limits(monkeypatch, name, good, bad, kind):
         reasons = extraction._reasons(one, one.uv)
         assert [r and r.kind for r in reasons] == [None, None, expected, None, None, None]
     away = beads(depth=np.ones(6))
-    limit = extraction.LAST_TOLERANCE_PX
+    limit = extraction.FIRST_RESIDUAL_PX
     predicted = away.uv + np.outer([0, limit, limit + 0.01, 0, 0, 0], [0.6, 0.8])
     found = extraction._reasons(away, predicted)
     assert [r is None for r in found] == [True, True, False, True, True, True]
@@ -202,8 +204,7 @@ def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others(
     kinds = [refusal.finding.kind for refusal in found.refused]
     assert kinds == [Kind.BEAD_AWAY, Kind.BEAD_UNSURE]
     assert found.refused[0].finding.numbers['off_px'] == pytest.approx(5)
-    # One image in a thousand has a bead so far off by chance.
-    limit = np.sqrt(-2 * np.log(1e-3 / n)) * np.hypot(sd_px[3], 0.06)
+    limit = extraction.RESIDUAL_SIGMAS * np.hypot(sd_px[3], 0.06)
     for part, is_kept in ((0.98, True), (1.02, False)):
         off[3] = part * limit
         one.uv = predicted + np.outer(off, [0.6, 0.8])
@@ -243,7 +244,7 @@ def test_bead_that_is_likely_half_a_pixel_off_is_not_observed(scatter, is_kept):
         np.arange(n), beads, [None] * n, predicted, np.full(n, scatter)
     )
     # The residual is within the limit of its own standard deviation.
-    assert np.sqrt(-2 * np.log(extraction.WRONG_SHARE / n)) * np.hypot(0.05, 0.12) > 0.5
+    assert extraction.RESIDUAL_SIGMAS * np.hypot(0.05, 0.12) > 0.5
     found = extraction._checked(None, None, None, measured, 'imaging')
     assert (4 in found.bead) is is_kept and len(found.bead) == n - 1 + is_kept
 

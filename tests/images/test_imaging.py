@@ -402,7 +402,7 @@ def radiograph_of_pairs(scatter: float, photons: float = 300) -> tuple[np.ndarra
     return rng.poisson(light).astype(np.float32), shadows
 
 
-@pytest.mark.parametrize(('scatter', 'photons'), [(0.03, 100), (0.1, 100)])
+@pytest.mark.parametrize(('scatter', 'photons'), [(0.03, 300), (0.1, 100)])
 def test_shadows_that_overlap_tell_the_scattered_light(scatter, photons):
     image, shadows = radiograph_of_pairs(scatter, photons)
     light = Light(image, np.ones(image.shape, bool))
@@ -411,7 +411,7 @@ def test_shadows_that_overlap_tell_the_scattered_light(scatter, photons):
     alone = _typical(light, shadows, np.ones(36), RADIUS)
     assert imaging.profile.scatter == pytest.approx(scatter, abs=0.01)
     assert imaging.profile.attenuation == pytest.approx(ABSORBED * RADIUS, abs=0.02)
-    assert abs(alone.scatter - scatter) > abs(imaging.profile.scatter - scatter)
+    assert abs(alone.scatter - scatter) > 0.015
 
 
 def test_scattered_light_stays_where_shadows_are_not_those_of_spheres():

@@ -17,6 +17,7 @@ from fluoro_calib_ros.images import growth, matching, pose_search
 from fluoro_calib_ros.images.detection import PIXELS_AT_ONCE, responses
 from fluoro_calib_ros.images.growth import (
     Seen,
+    _good_cells,
     _judged,
     _Kriging,
     _noise_share,
@@ -228,10 +229,24 @@ def test_evidence_of_a_match_counts_what_is_predicted_and_what_is_found():
 def test_a_bead_is_supported_by_half_of_its_neighbours():
     line = np.arange(40.0)[:, None] * [1, 0, 0]
     good = np.arange(40) < 20
-    # With four neighbours on either side, beads before the 20th have at least as many good ones.
+    # With six neighbours on either side, beads before the 20th have at least as many good ones.
     assert supported(line, good)[:19].all() and not supported(line, good)[21:].any()
     assert supported(line[:3], np.array([True, True, False])).tolist() == [True, True, True]
     assert not supported(line[:3], np.array([True, False, False]))[0]
+
+
+def test_regions_with_few_of_their_beads_are_left_out():
+    uv = np.repeat([[10.0, 10], [90, 10], [10, 190], [90, 190], [50, 100]], 5, axis=0)
+    found = np.array(5 * [1] + [1, 1, 0, 0, 0] + [1, 1, 1, 0, 0] + 5 * [1] + 5 * [0], bool)
+    good = _good_cells(uv, found, (200, 100)).reshape(5, 5)
+    assert [one.all() for one in good] == [True, False, True, True, False]
+    assert (good == good[:, :1]).all()
+    assert _good_cells(uv[:4], np.zeros(4, bool), (200, 100)).all()
+    # Width and height are not exchanged: a region is 20 px wide and 40 px high.
+    beside = np.repeat([[10.0, 10], [30, 10]], 5, axis=0)
+    assert _good_cells(beside, np.arange(10) < 5, (200, 100)).tolist() == 5 * [True] + 5 * [False]
+    over = np.repeat([[10.0, 10], [10, 30]], 5, axis=0)
+    assert not _good_cells(over, np.arange(10) < 5, (200, 100)).any()
 
 
 def test_residuals_are_predicted_as_by_dense_kriging():
@@ -524,6 +539,20 @@ def test_support_is_the_share_of_the_nearest_beads_in_space(count):
     xyz = rng.uniform(-50, 50, (count, 3))
     good = rng.random(count) < 0.5
     near = np.argsort(np.linalg.norm(xyz[:, None] - xyz[None], axis=2), axis=1)[:, 1:]
-    share = good[near[:, : growth.NEIGHBOURS]].mean(axis=1)
+    share = good[near[:, : growth.SUPPORT]].mean(axis=1)
     assert supported(xyz, good).tolist() == (share >= growth.MIN_SHARE).tolist()
     assert 0 < supported(xyz, good).mean() < 1 or count < 40
+
+
+def test_cells_of_an_image_are_bad_by_the_beads_that_are_found_in_them():
+    rng = np.random.default_rng(8)
+    uv = rng.uniform(-20, [1020, 620], (400, 2))
+    found = rng.random(400) < 0.55
+    cell = np.clip(np.floor(uv / [1000, 600] * growth.CELLS), 0, growth.CELLS - 1)
+    expected = []
+    for own in cell:
+        same = (cell == own).all(axis=1)
+        many = same.sum() >= growth.MIN_CELL
+        expected.append(not (many and found[same].sum() < 0.6 * same.sum()))
+    assert _good_cells(uv, found, (600, 1000)).tolist() == expected
+    assert 0.1 < np.mean(expected) < 0.9

@@ -22,7 +22,7 @@ from visualization_msgs.msg import MarkerArray
 
 from ..bodies.body import STATUS_NAMES, Body, PoseStatus
 from ..exposures.pairing import Pairer
-from ..findings import Finding
+from ..findings import Finding, first_few
 from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, IntersectedPoints
 from .messages.bodies import (
     BODY_FORMS,
@@ -264,6 +264,20 @@ class BodyState:
         return None if seen < 0 else (self.state.stamp_ns - seen) * 1e-9
 
 
+def _rejected_markers(body: BodyState) -> str:
+    """Return a message if markers do not fit the body in most of the recent exposures."""
+    shares = body.state.rejected[body.row, : len(body.body.target_id)]
+    ids = body.body.target_id[: len(shares)][shares > 0.5]
+    return (
+        ''
+        if not len(ids)
+        else (
+            f'markers {first_few(ids)} do not fit in most exposures: they have migrated, or the '
+            'coordinates of the body are mirrored, or those of another one'
+        )
+    )
+
+
 # Messages about the last pose of a body that has been seen, by its status.
 POSE_MESSAGES = {
     PoseStatus.FAILED: 'lost, its markers were last seen {0.unseen_s:.1f} s ago',
@@ -274,6 +288,7 @@ BODY_CONDITIONS = (
     counted('untimed', '{count} exposures in the last minute have the stamp of the one before'),
     warns(lambda body: body.unseen_s is None and 'not seen yet'),
     warns(lambda body: POSE_MESSAGES.get(body.status, '').format(body)),
+    warns(_rejected_markers),
     healthy('tracked'),
 )
 JOINT_CONDITIONS = (

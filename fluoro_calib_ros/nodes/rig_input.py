@@ -215,7 +215,7 @@ class RigInput:
 
 # A body's name is part of topic names, and the name of a TF frame.
 BODY_NAME = re.compile('[A-Za-z][A-Za-z0-9_]*')
-FORGETTING = 0.01  # weight of the newest exposure in the mean misfit
+FORGETTING = 0.01  # weight of the newest exposure in the mean misfit and share of rejections
 
 
 @dataclass(frozen=True)
@@ -283,6 +283,7 @@ class BodiesState(NamedTuple):
     seen_ns: NDArray[np.int64]
     #: (B,) mean of chi-squared over its expectation, of about the last 100 exposures; NaN if none
     misfit: NDArray[np.float64]
+    rejected: NDArray[np.float64]  #: (B, M) share of them in which each marker was excluded
 
 
 class BodyFollower:
@@ -338,6 +339,7 @@ class BodyFollower:
         self.joints = [JointTracker(entry.joint, entry.neutral) for entry in self._entries]
         self.state: BodiesState | None = None  #: None before the first exposure
         self._squares = np.zeros((2, len(self.bodies)))  # chi-squared and expectation
+        self._rejected = np.zeros((len(self.bodies), 1))
 
     def flush(self) -> list[BodiesContent]:
         """Return the contents of exposures that wait for later ones; the next is a new start."""
@@ -378,6 +380,9 @@ class BodyFollower:
         known = frame.alone & (frame.freedom > 0)
         newest = np.where(known, [frame.chi2, frame.freedom], 0.0)
         self._squares = (1 - FORGETTING * known) * self._squares + FORGETTING * newest
+        weight = FORGETTING * known[:, None]
+        excluded = np.isfinite(frame.test) & ~frame.used
+        self._rejected = (1 - weight) * self._rejected + weight * excluded
         before = np.full(len(self.bodies), -1) if self.state is None else self.state.seen_ns
         chi2, expected = self._squares
         markers = frame.markers
@@ -387,4 +392,5 @@ class BodyFollower:
             markers,
             seen_ns=np.where(markers > 0, tracked.stamp_ns, before),
             misfit=np.where(expected > 0, chi2 / np.where(expected > 0, expected, 1.0), np.nan),
+            rejected=self._rejected,
         )

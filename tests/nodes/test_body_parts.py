@@ -399,6 +399,18 @@ def numbers_in(sentence):
     return [float(number) for number in re.findall(r'\d+\.\d+', sentence)]
 
 
+def test_a_body_with_mirrored_coordinates_is_told_in_the_diagnostics():
+    """Three of its markers fit their mirror image: the poses have the status OK."""
+    mirrored = replace(BODIES[0], xyz_mm=BODIES[0].xyz_mm * [-1, 1, 1])
+    for body, level in ((BODIES[0], OK), (mirrored, WARN)):
+        follower = BodyFollower((body, BODIES[1]), [], 0)
+        contents = follow(follower, range(100), rng=np.random.default_rng(1))
+        assert contents[-1].poses[0].status[0] == PoseStatus.OK
+        femur, tibia = statuses_of(follower, RecentCounts())
+        assert (femur.level, tibia.level) == (level, OK)
+        assert ('do not fit in most exposures' in femur.message) == (level == WARN)
+
+
 def test_diagnostics_of_a_body_from_unseen_to_lost():
     follower = BodyFollower(BODIES, (), lag=0)
     assert statuses_of(follower, RecentCounts()) == []

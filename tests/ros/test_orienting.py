@@ -32,6 +32,9 @@ def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tra
     assert published[0].source == 'joint calibration' and published[0].exposures == 15
     for name in NAMES:
         client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'), name)
+    client.wait_for_diagnostics(
+        'reconstruction_node', lambda s: value_of(s, 'orientation'), 'reconstruction'
+    )
     publish(client, tracking, range(50), answer='b/corrected_observations')
     client.wait_until(lambda: len(points) >= 50, what='the first points')
     # Another calibration gives another orientation.
@@ -44,6 +47,12 @@ def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tra
             lambda s: value_of(s, 'calibration') == answer.calibration_id[f],
             name,
         )
+    client.wait_until(lambda: len(published) == 2, what='the second orientation')
+    client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: value_of(s, 'orientation') == published[-1].orientation_id,
+        'reconstruction',
+    )
     publish(client, tracking, range(100, 150), answer='b/corrected_observations')
     client.wait_until(
         lambda: points[-1].frame_number == tracking['a'][149].number, what='the last points'

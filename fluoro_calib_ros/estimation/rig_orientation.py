@@ -117,9 +117,9 @@ def _mean_rotation(figures: FluoroscopeResult) -> NDArray[np.float64]:
 # Most exposures used: with more, the interior orientations dominate the uncertainty.
 MAX_PAIRS = 30
 # The phantom moves if the median displacement between two frames of a capture exceeds this limit
-# [px], and CERTAIN standard deviations of the noise. Image points that are farther from the median
-# of their target are false matches.
+# [px], and CERTAIN standard deviations of the noise.
 MAX_STILL_PX = 1.0
+MAX_MATCH_SD = 5.0  # distance from the median of a target above which a match is false
 
 
 @dataclass(frozen=True)
@@ -323,8 +323,7 @@ def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
     """Average the frames of a fluoroscope; image_sd: noise of an image coordinate [px]."""
     if len(frames) == 1:
         return frames[0]
-    limit = max(MAX_STILL_PX, CERTAIN * image_sd)
-    _require_still(frames, limit)
+    _require_still(frames, max(MAX_STILL_PX, CERTAIN * image_sd))
     ids, row = np.unique(np.concatenate([f.target_id for f in frames]), return_inverse=True)
     uv = np.concatenate([f.uv for f in frames])
     sigma = np.concatenate(
@@ -334,6 +333,7 @@ def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
     ends = np.cumsum(np.bincount(row))[:-1]
     middle = np.array([np.median(uv[part], axis=0) for part in np.split(order, ends)])
     offset = uv - middle[row]
+    limit = max(MAX_STILL_PX, MAX_MATCH_SD * image_sd)
     weight = np.where(np.linalg.norm(offset, axis=1) <= limit, sigma**-2.0, 0.0)
     total = np.bincount(row, weight, len(ids))
     matched = total > 0

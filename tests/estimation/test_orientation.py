@@ -753,7 +753,7 @@ def test_orient_refuses_invalid_input_in_one_sentence(folder, capsys):
     assert 'the phantom does not stand still, between frames 1 and 2' in said(
         capsys, 'orient', folder / 'calibration', '--exposures', '1-2', *given
     )
-    assert 'there is no frame of the phantom' in said(
+    assert 'no fluoroscope has the exposures 99 of --exposures' in said(
         capsys, 'orient', folder / 'calibration', '--exposures', '99', *given
     )
     assert 'is not on the phantom' in said(capsys, 'orient', folder / 'tracking', *given)

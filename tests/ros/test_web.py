@@ -18,6 +18,7 @@ from dicom_files import dicom
 from ros_graph import NAMES, Process, entry_point, standing
 from sensor_msgs.msg import Image
 
+from fluoro_calib_ros.images.overlay import UNEXPLAINED
 from fluoro_calib_ros.nodes.messages.image import message_from_image
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 
@@ -160,5 +161,5 @@ def test_page_shows_what_the_rig_sees_and_has_measured(graph, calibrated, exposu
             what='a picture of the coverage',
         )
         colours = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-        framed = (colours[..., ::-1] == (255, 200, 0)).all(axis=2)
+        framed = (colours == UNEXPLAINED).all(axis=2)
         assert 0.005 < framed.mean() < 0.1

@@ -289,10 +289,10 @@ def test_targets_of_some_frames_have_their_own_weight():
 
 @pytest.mark.parametrize(
     'off, image_sd, used',
-    [(1.15, 0.3, True), (1.25, 0.3, False), (0.95, 0.1, True), (1.05, 0.1, False)],
+    [(1.2, 0.25, True), (1.3, 0.25, False), (0.95, 0.1, True), (1.05, 0.1, False)],
 )
 def test_false_matches_of_a_capture_are_those_far_from_the_median(off, image_sd, used):
-    """The limit is four standard deviations, but at least a pixel."""
+    """The limit is five standard deviations, but at least a pixel."""
     frames = still([[0.0, 0.0]] * 5)
     uv = frames[2].uv.copy()
     uv[1] += [0.6 * off, -0.8 * off]

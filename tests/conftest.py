@@ -42,17 +42,6 @@ def pytest_sessionfinish() -> None:
 
 
 @pytest.fixture(scope='session', autouse=True)
-def shared_results(tmp_path_factory):
-    """Let the workers of a run share calibrations; see once() in tests/rigs.py."""
-    with pytest.MonkeyPatch.context() as patch:
-        if 'PYTEST_XDIST_WORKER' in os.environ:
-            folder = tmp_path_factory.getbasetemp().parent / 'shared'
-            folder.mkdir(exist_ok=True)
-            patch.setenv('FLUORO_CALIB_TEST_SHARED', str(folder))
-        yield
-
-
-@pytest.fixture(scope='session', autouse=True)
 def ports(tmp_path_factory):
     """Reserve ports before any test creates a node: Fast DDS reads its profile only once."""
     with own_ports(tmp_path_factory.mktemp('dds')):
@@ -60,7 +49,22 @@ def ports(tmp_path_factory):
 
 
 ROS = 'tests/ros/'
-# Files that take more than 20 s, longest first. Short ones fill the gaps at the end.
+# Files whose tests share the calibrations of tests/rigs.py or tests/turning_rig.py: they run in
+# the same worker, so that each calibration is computed once.
+SHARING = (
+    'tests/estimation/test_calibration.py',
+    'tests/estimation/test_self_calibration.py',
+    'tests/estimation/test_orientation.py',
+    'tests/estimation/test_grid.py',
+    'tests/images/test_undistortion.py',
+    'tests/estimation/test_collocation.py',
+    'tests/estimation/test_local_signal.py',
+    'tests/estimation/test_angle_field.py',
+    'tests/images/test_angle_maps.py',
+    'tests/checks/test_turning.py',
+    'tests/checks/test_validation.py',
+)
+# Scopes that take more than 20 s, longest first. Short ones fill the gaps at the end.
 LENGTHY = (
     'tests/ros/test_extraction_node.py',
     'tests/ros/test_live_healing.py',
@@ -72,9 +76,7 @@ LENGTHY = (
     'tests/ros/test_integration.py',
     'tests/ros/test_orienting.py',
     'tests/ros/test_web.py',
-    'tests/checks/test_validation.py',
-    'tests/checks/test_turning.py',
-    'tests/estimation/test_calibration.py',
+    SHARING[0],
     'tests/healing/test_healing.py',
     'tests/estimation/test_survey.py',
     'tests/report/test_experiment.py',
@@ -94,19 +96,24 @@ if LoadFileScheduling is not None:
     class TwoWorkersForRos(LoadFileScheduling):
         """Keep the tests of a file on one worker, and all tests with ROS nodes on two.
 
-        The tests of a file share fixtures. ROS nodes mostly wait, so two workers run them, file
-        by file, while a third one computes; more graphs at once would only slow each other down.
+        The tests of a file share fixtures, and those of SHARING calibrations. ROS nodes mostly
+        wait, so two workers run them, file by file, while a third one computes; more graphs at
+        once would only slow each other down.
         """
 
+        def _split_scope(self, nodeid: str) -> str:
+            name = super()._split_scope(nodeid)
+            return SHARING[0] if name in SHARING else name
+
         def _assign_work_unit(self, node) -> None:
-            """Assign a file with ROS nodes to the first two workers, while there are any."""
-            of_ros = [file for file in self.workqueue if file.startswith(ROS)]
-            others = [file for file in self.workqueue if not file.startswith(ROS)]
-            files = (of_ros if node in self.nodes[:2] else []) or others
-            if not files:
+            """Assign a scope with ROS nodes to the first two workers, while there are any."""
+            of_ros = [scope for scope in self.workqueue if scope.startswith(ROS)]
+            others = [scope for scope in self.workqueue if not scope.startswith(ROS)]
+            scopes = (of_ros if node in self.nodes[:2] else []) or others
+            if not scopes:
                 node.shutdown()
                 return
-            longest = next((file for file in LENGTHY if file in files), files[0])
+            longest = next((scope for scope in LENGTHY if scope in scopes), scopes[0])
             self.workqueue.move_to_end(longest, last=False)
             super()._assign_work_unit(node)
 

@@ -4,13 +4,8 @@
 """Shared fixtures: virtual rigs, cached calibrations of them and small networks."""
 
 import contextlib
-import fcntl
 import functools
-import hashlib
-import os
-import pickle
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -89,27 +84,6 @@ def adjusted(noise_px, **rmse):
     )
 
 
-# Environment variable with the folder of results that the workers of a run share.
-SHARED = 'FLUORO_CALIB_TEST_SHARED'
-
-
-def once(compute, *arguments):
-    """Return compute(*arguments), which the first worker to need it computes for all of them."""
-    if SHARED not in os.environ:
-        return compute(*arguments)
-    key = hashlib.sha256(pickle.dumps((compute, arguments))).hexdigest()
-    path = Path(os.environ[SHARED], f'{key}.pickle')
-    with open(path.with_suffix('.lock'), 'w') as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if path.exists():
-            return pickle.loads(path.read_bytes())
-        result = compute(*arguments)
-        begun = path.with_suffix('.begun')
-        begun.write_bytes(pickle.dumps(result))
-        begun.rename(path)
-        return result
-
-
 @functools.cache
 def rig():
     """The virtual rig of the tests."""
@@ -129,10 +103,6 @@ def calibrated(name='a', count=15, **options):
 
 @functools.cache
 def _calibrated(name, count, options):
-    return once(_calibration, name, count, options)
-
-
-def _calibration(name, count, options):
     return calibrate({name: exposures()[name][:count]}, rig().phantom, options)
 
 

@@ -7,7 +7,7 @@ import functools
 from dataclasses import replace
 
 import numpy as np
-from rigs import exposures, once, rig
+from rigs import exposures, rig
 
 from fluoro_calib_ros.estimation.calibrate import calibrate
 
@@ -58,8 +58,4 @@ def turning(known=True):
 
 @functools.cache
 def _turning(known):
-    return once(_calibration, known)
-
-
-def _calibration(known):
     return calibrate({'a': recording(known)[0]}, rig().phantom)

@@ -128,8 +128,10 @@ ALTERNATIVES = ('local_linear', 'knn', 'parametric')
 # Neighbour models and the largest k to try: with more neighbours they follow a distortion no
 # better than collocation does.
 MAX_NEIGHBOURS: dict[type[NeighbourModel], int] = {LocalLinearModel: 100, KnnModel: 40}
-# Most predictions compared for a fluoroscope: more do not discriminate the models better.
-MAX_TESTED = 5_000
+# Most predictions compared for a fluoroscope. If two models differ by a share d of the noise, the
+# ratio of their squared errors scatters by 2 d / sqrt(2 MAX_TESTED): by 0.004 where one has 1 %
+# more. With five times as many, ratios of 13 calibrations below 1.05 changed by 0.01 at most.
+MAX_TESTED = 1_000
 # With more image points of a fluoroscope, no other model was better than collocation.
 MAX_IMAGE_POINTS = 40_000
 

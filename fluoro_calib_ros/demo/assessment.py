@@ -9,7 +9,7 @@ import json
 import os
 import socket
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bodies.body import fitted_pose
 from ..correction.fluoroscope_calibration import Calibrations
-from ..photogrammetry.collinearity import project
-from ..photogrammetry.rotations import matrix_from_quaternion
+from ..nodes.demo_client import DemoClient, DemoError
 from ..processes import Programs
-from ..simulation.rig import DistortionField
+from ..simulation.rig import VirtualRig, virtual_rig
 
 # UDP port of the first participant of a ROS domain (DDSI-RTPS 2.5, section 9.6.1.1).
 DISCOVERY_PORT = 7400
@@ -57,6 +57,18 @@ class NodeProcesses(Programs):
             log=self._directory / f'{log_name}.log',
         )
 
+    def wait(
+        self,
+        client: DemoClient,
+        condition: Callable[[], bool],
+        timeout_s: float,
+        description: str,
+    ) -> None:
+        """Let a client wait for a condition. Raises DemoError, also if a node has failed."""
+        client.wait(lambda: condition() or self.failed(), timeout_s, description)
+        if self.failed():
+            raise DemoError(f'a node ended with a fault, see the logs in {self._directory}')
+
 
 def isolate_ros_graph() -> None:
     """Restrict this process and its children to this machine and a free ROS domain.
@@ -78,6 +90,30 @@ def _is_free(domain: int) -> bool:
         except OSError:
             return False
     return True
+
+
+@dataclass(frozen=True)
+class RecordedRig:
+    """The virtual rig with which the bags were made."""
+
+    rig: VirtualRig
+    seed: int
+    noise_px: float  #: standard deviation of an image coordinate
+    exposures: int
+    markers: dict[tuple[int, int], NDArray[np.float64]]  #: true positions [mm] by (frame, target)
+
+    @classmethod
+    def of(cls, bags: Path, names: Sequence[str]) -> RecordedRig:
+        """Return the rig of fluoroscopes described by the truth in a folder of bags."""
+        settings = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
+        rows = np.loadtxt(bags / 'truth' / 'markers.csv', delimiter=',', skiprows=1)
+        return cls(
+            virtual_rig(settings['seed'], settings['strength'], names),
+            seed=settings['seed'],
+            noise_px=settings['noise'],
+            exposures=settings['exposures'],
+            markers={(int(row[0]), int(row[1])): row[2:] for row in rows},
+        )
 
 
 # Frames and source timestamps [ns] by (fluoroscope, frame number); frames have target_id, u and v.
@@ -107,7 +143,7 @@ def latencies_ms(sent: Frames, corrected: Frames) -> NDArray[np.float64]:
 
 
 def image_errors(
-    bags: Path, names: Sequence[str], sent: Frames, corrected: Frames
+    recorded: RecordedRig, sent: Frames, corrected: Frames
 ) -> dict[str, tuple[float, float]]:
     """Return the RMSE of the observed and of the corrected markers by fluoroscope [px].
 
@@ -115,10 +151,9 @@ def image_errors(
     interior orientation. Therefore a projective map from the image to the truth is fitted first,
     for both observed and corrected markers.
     """
-    rig = json.loads((bags / 'truth' / 'rig.json').read_text())['fluoroscopes']
-    truth = _true_markers(bags)
     errors = {}
-    for name in names:
+    for true in recorded.rig.fluoroscopes:
+        name = true.name
         observed = []
         undistorted = []
         points = []
@@ -127,8 +162,8 @@ def image_errors(
                 source = sent[name, number][0]
                 observed.append(np.stack([source.u, source.v], axis=1))
                 undistorted.append(np.stack([frame.u, frame.v], axis=1))
-                points += [truth[number, i] for i in frame.target_id]
-        ideal = _ideal_projection(rig[name], np.array(points))
+                points += [recorded.markers[number, i] for i in frame.target_id]
+        ideal = true.ideal(np.array(points))
         errors[name] = (
             projective_lack_of_fit(np.concatenate(observed), ideal),
             projective_lack_of_fit(np.concatenate(undistorted), ideal),
@@ -136,39 +171,28 @@ def image_errors(
     return errors
 
 
-def calibration_errors(bags: Path, calibrations: Calibrations) -> dict[str, float]:
+def calibration_errors(recorded: RecordedRig, calibrations: Calibrations) -> dict[str, float]:
     """Return the RMSE of the true markers, observed without noise and corrected [px].
 
     By fluoroscope, after the best projective map as in image_errors().
     """
-    rig = json.loads((bags / 'truth' / 'rig.json').read_text())['fluoroscopes']
-    points = np.array(list(_true_markers(bags).values()))
+    points = np.array(list(recorded.markers.values()))
     errors = {}
-    for name, calibration in calibrations.items():
-        ideal = _ideal_projection(rig[name], points)
-        distortion = rig[name]['distortion']
-        field = DistortionField(
-            np.array(distortion['centre']),
-            distortion['pincushion'],
-            np.array(distortion['s_shape']),
-            distortion['spiral'],
-            np.array(distortion['ripples']),
-        )
-        observed = field.distort(ideal)
-        u, v, *_ = calibration.correct_arrays(observed[:, 0], observed[:, 1])
-        errors[name] = projective_lack_of_fit(np.column_stack([u, v]), ideal)
+    for true in recorded.rig.fluoroscopes:
+        ideal = true.ideal(points)
+        u, v, *_ = calibrations[true.name].correct_arrays(*true.distortion.distort(ideal).T)
+        errors[true.name] = projective_lack_of_fit(np.column_stack([u, v]), ideal)
     return errors
 
 
 def space_figures(
-    bags: Path, points: Sequence[tuple[Any, int]], sent: Frames, first: str
+    recorded: RecordedRig, points: Sequence[tuple[Any, int]], sent: Frames, first: str
 ) -> SpaceFigures:
     """Return the accuracy and latency of reconstructed points.
 
     Parameters
     ----------
-    bags : Path
-        Folder of the bags with their truth.
+    recorded : RecordedRig
     points : sequence of (GoodPoints, int)
         Points and their source timestamps [ns].
     sent : mapping
@@ -176,11 +200,11 @@ def space_figures(
     first : str
         First fluoroscope, whose frame numbers the points have.
     """
-    truth = _true_markers(bags)
-    true_mm = [truth[p.frame_number, i] for p, _ in points for i in p.target_id]
+    true_mm = [recorded.markers[p.frame_number, i] for p, _ in points for i in p.target_id]
     measured = np.concatenate([p.xyz_mm for p, _ in points])
     covariance = np.concatenate([p.covariance for p, _ in points])
-    error = _error_after_rigid_fit(measured, np.array(true_mm))
+    rotation, shift = fitted_pose(np.array(true_mm), measured)
+    error = measured - (np.array(true_mm) @ rotation.T + shift)
     weighted = np.einsum('ni,nij,nj->n', error, np.linalg.inv(covariance), error)
     latency = [
         (stamp - sent[first, p.frame_number][1]) * 1e-6
@@ -213,30 +237,3 @@ def projective_lack_of_fit(uv: NDArray[np.float64], ideal: NDArray[np.float64]) 
     mapped = np.stack([x, y, ones], axis=1) @ h.T
     residual = IMAGE_SCALE * (mapped[:, :2] / mapped[:, 2:] - np.stack([u, v], axis=1))
     return float(np.sqrt(np.mean(residual**2)))
-
-
-def _true_markers(bags: Path) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Return the true positions [mm] by (frame, target)."""
-    rows = np.loadtxt(bags / 'truth' / 'markers.csv', delimiter=',', skiprows=1)
-    return {(int(row[0]), int(row[1])): row[2:] for row in rows}
-
-
-def _ideal_projection(true: Mapping[str, Any], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the undistorted image points (n, 2) of points (n, 3) in a true fluoroscope."""
-    n = len(points)
-    return project(
-        np.broadcast_to(matrix_from_quaternion(true['quaternion_wxyz']), (n, 3, 3)),
-        np.broadcast_to(true['position_mm'], (n, 3)),
-        points,
-        np.array([true['interior'][key] for key in ('xp', 'yp', 'c')]),
-    )
-
-
-def _error_after_rigid_fit(
-    measured: NDArray[np.float64], true: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return measured - true (n, 3) after the best rotation and shift of true (Kabsch)."""
-    a = measured - measured.mean(axis=0)
-    b = true - true.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    return a - b @ (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T

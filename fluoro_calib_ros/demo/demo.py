@@ -28,13 +28,19 @@ from ..io.phantom import read_phantom
 from ..nodes.demo_client import DemoClient, DemoError, demo_clients
 from ..report.report_figures import write_figures
 from ..report.tables import markdown_table, summary_table
-from .assessment import NodeProcesses, image_errors, isolate_ros_graph, latencies_ms, space_figures
+from .assessment import (
+    NodeProcesses,
+    RecordedRig,
+    image_errors,
+    isolate_ros_graph,
+    latencies_ms,
+    space_figures,
+)
 from .image_twin import (
     NAMESPACE,
     PLAYED,
     ImageTwin,
     LiveKnee,
-    RecordedRig,
     calibrate_from_images,
     comparison_table,
 )
@@ -59,15 +65,12 @@ def run_graph(bags: Path, out: Path, client: DemoClient, knee: LiveKnee) -> int:
         nodes.start(
             'player_node', {'bag': bags / 'calibration', 'rate': 5.0, 'wait_for_readers': 3}
         )
-        client.wait(
-            lambda: (
-                min(client.exposures.values(), default=0) >= min(recorded.values())
-                or nodes.failed()
-            ),
+        nodes.wait(
+            client,
+            lambda: min(client.exposures.values(), default=0) >= min(recorded.values()),
             60,
             'the exposures',
         )
-        _raise_if_failed(nodes, out)
         print('2  client -> calibration node: self-calibrate')
         message = client.self_calibrate(lambda line: print(f'    {line}', flush=True))
         print(f'    {message}')
@@ -78,13 +81,11 @@ def run_graph(bags: Path, out: Path, client: DemoClient, knee: LiveKnee) -> int:
             'player_node', {'bag': knee.bag, 'rate': PLAYED, 'wait_for_readers': 3}
         )
         wait_for_stream(client, player, nodes, knee.frames)
-        _raise_if_failed(nodes, out)
         print('4  the same: markers in motion')
         for frames in (client.sent, client.corrected, client.points):
             frames.clear()
         player = nodes.start('player_node', {'bag': bags / 'tracking', 'wait_for_readers': 3})
         wait_for_stream(client, player, nodes, tracked)
-        _raise_if_failed(nodes, out)
     if not client.corrected or not client.points:
         raise DemoError(f'no corrected frames or no points have arrived, see the logs in {out}')
     return sum(tracked.values()) - len(client.corrected)
@@ -114,15 +115,22 @@ def wait_for_stream(
             and len(client.points) >= min(tracked.values())
             and client.corrected.keys() <= client.sent.keys()
         )
-        return complete or bool(nodes.failed()) or time.monotonic() > quiet_since + QUIET_S
+        return complete or time.monotonic() > quiet_since + QUIET_S
 
-    client.wait(is_over, 120, 'the end of the stream')
+    nodes.wait(client, is_over, 120, 'the end of the stream')
     for key in client.corrected.keys() - client.sent.keys():  # no latency without the source frame
         del client.corrected[key]
 
 
 def report(
-    bags: Path, out: Path, client: DemoClient, lost: int, start: float, texts: Sequence[str]
+    bags: Path,
+    out: Path,
+    client: DemoClient,
+    recorded: RecordedRig,
+    *,
+    lost: int,
+    start: float,
+    texts: Sequence[str],
 ) -> bool:
     """Write and print the table; return whether live and offline calibration are identical.
 
@@ -133,6 +141,7 @@ def report(
     bags, out : Path
     client : DemoClient
         With the messages that it has recorded.
+    recorded : RecordedRig
     lost : int
         Number of corrected frames that did not arrive.
     start : float
@@ -149,7 +158,13 @@ def report(
         for name, calibration in client.calibrations.items()
     }
     knee_text, comparison = texts
-    lines = [*_image_lines(bags, client, job), '', _space_line(bags, client), knee_text, '']
+    lines = [
+        *_image_lines(recorded, client, job),
+        '',
+        _space_line(recorded, client),
+        knee_text,
+        '',
+    ]
     lines += ['Calibrated from coordinates and from radiographs:', comparison, '']
     lines.append(
         'Calibration through the nodes and without ROS is identical to the last bit: '
@@ -167,10 +182,10 @@ def report(
     return all(is_equal.values())
 
 
-def _image_lines(bags: Path, client: DemoClient, job: CalibrationResult) -> list[str]:
+def _image_lines(recorded: RecordedRig, client: DemoClient, job: CalibrationResult) -> list[str]:
     """Return the tables of the calibration and of the corrected markers."""
     latency = latencies_ms(client.sent, client.corrected)
-    errors = image_errors(bags, client.names, client.sent, client.corrected)
+    errors = image_errors(recorded, client.sent, client.corrected)
     summary = summary_table(
         job,
         {
@@ -199,9 +214,9 @@ def _image_lines(bags: Path, client: DemoClient, job: CalibrationResult) -> list
     ]
 
 
-def _space_line(bags: Path, client: DemoClient) -> str:
+def _space_line(recorded: RecordedRig, client: DemoClient) -> str:
     """Return the accuracy of reconstructed points in one line."""
-    space = space_figures(bags, client.good_points(), client.sent, client.names[0])
+    space = space_figures(recorded, client.good_points(), client.sent, client.names[0])
     return (
         f'In space: {space.exposures} exposures, {100 * space.good_fraction:.1f} % of the points; '
         f'RMSE against the truth {space.rmse_mm:.3f} mm (3-D), squared error over its variance '
@@ -234,11 +249,6 @@ def _start_nodes(
     )
     nodes.start('correction_node', {'fluoroscopes': fluoroscopes})
     nodes.start('reconstruction_node', {'fluoroscopes': fluoroscopes, **knee.parameters})
-
-
-def _raise_if_failed(nodes: NodeProcesses, out: Path) -> None:
-    if nodes.failed():
-        raise DemoError(f'a node ended with a fault, see the logs in {out}')
 
 
 def default_bags() -> Path:
@@ -280,16 +290,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 twin, options.bags, options.out, image_client
             )
             comparison = comparison_table(
-                options.bags,
-                names,
-                {'coordinates': client.calibrations, 'images': image_calibrations},
+                recorded, {'coordinates': client.calibrations, 'images': image_calibrations}
             )
             make_folder(options.out / 'figures')
             knee_text = knee.assess(client.joint_angles, options.out / 'figures' / 'knee_live.png')
             passed = report(
                 options.bags,
                 options.out,
-                client=client,
+                client,
+                recorded,
                 lost=lost,
                 start=start,
                 texts=(knee_text, comparison),

@@ -5,10 +5,9 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,34 +35,13 @@ from ..report.figures import png_bytes
 from ..report.motion import joint_figure
 from ..report.tables import markdown_table
 from ..simulation.knee import LANDING_HZ, LANDING_S, landing, simulate_knee, virtual_knee
-from ..simulation.rig import VirtualRig, simulate_exposures, virtual_rig
-from .assessment import NodeProcesses, calibration_errors
+from ..simulation.rig import VirtualRig, simulate_exposures
+from .assessment import NodeProcesses, RecordedRig, calibration_errors
 
 NAMESPACE = 'images'
 EXPOSURES = 6  # number of exposures of the bag that are rendered
 START_NS = 1_700_000_000_000_000_000
 INTERVAL_NS = 500_000_000
-
-
-@dataclass(frozen=True)
-class RecordedRig:
-    """The virtual rig with which the bags were made."""
-
-    rig: VirtualRig
-    seed: int
-    noise_px: float  #: standard deviation of an image coordinate
-    exposures: int
-
-    @classmethod
-    def of(cls, bags: Path, names: Sequence[str]) -> RecordedRig:
-        """Return the rig of fluoroscopes described by the truth in a folder of bags."""
-        settings = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
-        return cls(
-            virtual_rig(settings['seed'], settings['strength'], names),
-            seed=settings['seed'],
-            noise_px=settings['noise'],
-            exposures=settings['exposures'],
-        )
 
 
 class ImageTwin:
@@ -156,22 +134,21 @@ def calibrate_from_images(
         nodes.start(
             'calibration_node', {**rig, 'calibration_directory': out / NAMESPACE / 'calibration'}
         )
-        client.wait(lambda: client.exposures or nodes.failed(), 60, 'the calibration node')
+        nodes.wait(client, lambda: bool(client.exposures), 60, 'the calibration node')
         nodes.start('player_node', {'bag': twin.bag})
-        client.wait(
-            lambda: min(client.exposures.values(), default=0) >= count or nodes.failed(),
+        nodes.wait(
+            client,
+            lambda: min(client.exposures.values(), default=0) >= count,
             120,
             'the exposures from images',
         )
-        if nodes.failed():
-            raise DemoError(f'a node ended with a fault, see the logs in {out}')
         message = client.self_calibrate(lambda line: None)
         print(f'    {message}')
         client.wait(lambda: len(client.calibrations) == len(client.names), 20, 'the calibrations')
     return client.calibrations
 
 
-def comparison_table(bags: Path, names: Sequence[str], ways: Mapping[str, Calibrations]) -> str:
+def comparison_table(recorded: RecordedRig, ways: Mapping[str, Calibrations]) -> str:
     """Return a table of the calibrations from coordinates and from images, against the truth."""
     head = [
         'fluoroscope',
@@ -184,8 +161,7 @@ def comparison_table(bags: Path, names: Sequence[str], ways: Mapping[str, Calibr
     ]
     rows = []
     for way, calibrations in ways.items():
-        errors = calibration_errors(bags, calibrations)
-        for name in names:
+        for name, error in calibration_errors(recorded, calibrations).items():
             calibration = calibrations[name]
             rows.append(
                 [
@@ -195,7 +171,7 @@ def comparison_table(bags: Path, names: Sequence[str], ways: Mapping[str, Calibr
                     str(calibration.observations),
                     f'{np.hypot(*calibration.rmse_after) / np.sqrt(2):.3f}',
                     f'{calibration.interior[2]:.2f}',
-                    f'{errors[name]:.3f}',
+                    f'{error:.3f}',
                 ]
             )
     return markdown_table(head, sorted(rows))

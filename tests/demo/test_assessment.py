@@ -3,8 +3,8 @@
 
 """Figures of the demonstration, for results whose errors are known."""
 
-import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace as Fake
 
@@ -15,7 +15,6 @@ from fluoro_calib_ros.demo import assessment
 from fluoro_calib_ros.demo.image_twin import LiveKnee
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.knee import landing, virtual_knee
-from fluoro_calib_ros.simulation.rig import DistortionField
 
 BAGS = Path(__file__).parents[2] / 'bags'
 FRAMES = range(1, 31)
@@ -23,9 +22,8 @@ FRAMES = range(1, 31)
 
 @pytest.fixture(scope='module')
 def truth():
-    """Return the markers by (frame, target) and the true rig."""
-    rig = json.loads((BAGS / 'truth' / 'rig.json').read_text())['fluoroscopes']
-    return assessment._true_markers(BAGS), rig
+    """Return the true rig of the bags and its markers."""
+    return assessment.RecordedRig.of(BAGS, ['a', 'b'])
 
 
 def markers_of(truth, frame):
@@ -40,13 +38,12 @@ def test_latency_is_from_the_frame_to_its_correction():
 
 
 def test_points_in_space_are_compared_after_the_best_rotation_and_shift(truth):
-    markers, _ = truth
     rng = np.random.default_rng(1)
     turn = matrix_from_vector(np.array([0.3, -0.2, 0.5]))
     sd = np.array([0.1, 0.2, 0.4])
     points, sent = [], {}
     for frame in FRAMES:
-        ids, xyz = markers_of(markers, frame)
+        ids, xyz = markers_of(truth.markers, frame)
         measured = (xyz + rng.normal(0, sd, xyz.shape)) @ turn.T + [10.0, -20.0, 30.0]
         covariance = np.broadcast_to(turn @ np.diag(sd**2) @ turn.T, (len(ids), 3, 3))
         found = Fake(
@@ -59,7 +56,7 @@ def test_points_in_space_are_compared_after_the_best_rotation_and_shift(truth):
         points.append((found, 1_000_000 * frame + 3_000_000))
         if frame > 1:
             sent['a', frame] = (None, 1_000_000 * frame)
-    figures = assessment.space_figures(BAGS, points, sent, 'a')
+    figures = assessment.space_figures(truth, points, sent, 'a')
     assert figures.rmse_mm == pytest.approx(np.sqrt(np.sum(sd**2)), rel=0.1)
     assert figures.normalised == pytest.approx(1, rel=0.1)
     assert (figures.good_fraction, figures.exposures) == (0.5, len(FRAMES))
@@ -67,13 +64,13 @@ def test_points_in_space_are_compared_after_the_best_rotation_and_shift(truth):
 
 
 def test_image_errors_are_what_no_projective_map_explains(truth):
-    markers, rig = truth
     rng = np.random.default_rng(2)
     sent, corrected = {}, {}
     for frame in FRAMES:
-        ids, xyz = markers_of(markers, frame)
-        for name, noise in (('a', 0.5), ('b', 0.1)):
-            ideal = assessment._ideal_projection(rig[name], xyz)
+        ids, xyz = markers_of(truth.markers, frame)
+        for fluoroscope, noise in zip(truth.rig.fluoroscopes, (0.5, 0.1)):
+            name = fluoroscope.name
+            ideal = fluoroscope.ideal(xyz)
             observed = ideal + rng.normal(0, 5 * noise, ideal.shape)
             # The sensor plane of a calibration may be any; errors refer to the true plane.
             turned = 1.5 * ideal @ [[1.02, 0.03], [-0.02, 0.97]] + [12.0, -7.0]
@@ -81,21 +78,14 @@ def test_image_errors_are_what_no_projective_map_explains(truth):
             turned += rng.normal(0, 1.5 * noise, ideal.shape)
             sent[name, frame] = (Fake(u=observed[:, 0], v=observed[:, 1]), 0)
             corrected[name, frame] = (Fake(u=turned[:, 0], v=turned[:, 1], target_id=ids), 0)
-    errors = assessment.image_errors(BAGS, ['a', 'b'], sent, corrected)
+    errors = assessment.image_errors(truth, sent, corrected)
     np.testing.assert_allclose(errors['a'], (2.5, 0.5), rtol=0.1)
     np.testing.assert_allclose(errors['b'], (0.5, 0.1), rtol=0.1)
 
 
 def test_a_calibration_has_the_error_that_its_correction_leaves(truth):
-    _, rig = truth
-    parts = {key: np.asarray(value) for key, value in rig['a']['distortion'].items()}
-    field = DistortionField(
-        parts['centre'],
-        parts['pincushion'],
-        parts['s_shape'],
-        parts['spiral'],
-        ripples=parts['ripples'],
-    )
+    field = truth.rig.fluoroscopes[0].distortion
+    only_a = replace(truth, rig=replace(truth.rig, fluoroscopes=truth.rig.fluoroscopes[:1]))
 
     def corrected(share):
         def correct(u, v):
@@ -105,7 +95,7 @@ def test_a_calibration_has_the_error_that_its_correction_leaves(truth):
         return Fake(correct_arrays=correct)
 
     left = [
-        assessment.calibration_errors(BAGS, {'a': corrected(share)})['a']
+        assessment.calibration_errors(only_a, {'a': corrected(share)})['a']
         for share in (1.0, 0.9, 0.0)
     ]
     assert left[0] < 1e-6

@@ -26,10 +26,9 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
 from benchmarks.bead_images import bead_image
-from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
+from fluoro_calib_ros.nodes.runtime.lifecycle import StreamNode
 from fluoro_calib_ros.nodes.runtime.main import run
 from fluoro_calib_ros.nodes.runtime.parameters import ParameterGroup
-from fluoro_calib_ros.nodes.runtime.streams import StreamReader
 from fluoro_calib_ros.nodes.runtime.topics import (
     images_qos,
     wait_for_readers,
@@ -104,27 +103,19 @@ class Camera(Node):
         self._worker.join(2.0)
 
 
-class Relay(ManagedNode):
+class Relay(StreamNode):
     """Republishes every image of a/image_raw on a/relayed."""
 
     def __init__(self) -> None:
         super().__init__('relay')
-        self._reader: StreamReader | None = None
 
-    def activate(self) -> None:
+    def create_readers(self) -> None:
         """Start to relay."""
-        reader = StreamReader(self, all_fatal(self))
+        reader = self.create_reader(all_fatal(self))
         publisher = self.create_publisher(Image, 'a/relayed', images_qos())
         reader.subscribe(
             Image, 'a/image_raw', lambda message, _: publisher.publish(message), images_qos()
         )
-        reader.start()
-        self._reader = reader
-
-    def deactivate(self) -> None:
-        """Stop relaying."""
-        if self._reader is not None:
-            self._reader.stop()
 
 
 if __name__ == '__main__':

@@ -16,34 +16,28 @@ from typing import Any
 
 from fluoro_calib_msgs.msg import TargetObservations
 
-from fluoro_calib_ros.nodes.runtime.diagnostics import (
-    OK,
-    DiagnosticsPublisher,
-    LatencyWindow,
-    Status,
-)
-from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
+from fluoro_calib_ros.nodes.runtime.diagnostics import OK, LatencyWindow, Status
+from fluoro_calib_ros.nodes.runtime.lifecycle import StreamNode
 from fluoro_calib_ros.nodes.runtime.main import run
-from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader
+from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers
 from fluoro_calib_ros.nodes.runtime.topics import observations_qos
 
 
-class Relay(ManagedNode):
+class Relay(StreamNode):
     """Republishes <fluoroscope>/target_observations on <fluoroscope>/relayed_KIND."""
 
     def __init__(self, kind: str) -> None:
         super().__init__(f'relay_{kind}')
         self._kind = kind
-        self._reader: StreamReader | None = None
         self._latencies = {name: LatencyWindow() for name in 'ab'}
 
-    def activate(self) -> None:
+    def create_readers(self) -> None:
         """Start to relay."""
-        self._reader = StreamReader(self, all_fatal(self))
+        reader = self.create_reader(all_fatal(self)) if self._kind == 'streams' else None
         for name in 'ab':
             topic = f'{name}/target_observations'
             relay = self._relay(name)
-            if self._kind == 'plain':
+            if reader is None:
                 self.create_subscription(
                     TargetObservations,
                     topic,
@@ -51,17 +45,13 @@ class Relay(ManagedNode):
                     observations_qos(),
                 )
             else:
-                self._reader.subscribe(TargetObservations, topic, relay, observations_qos())
-        if self._kind == 'streams':
-            self._reader.start()
-        diagnostics = DiagnosticsPublisher(self)
-        self.create_timer(
-            1.0,
-            lambda: diagnostics.publish(
-                Status(name, OK, '', latencies.values())
-                for name, latencies in self._latencies.items()
-            ),
-        )
+                reader.subscribe(TargetObservations, topic, relay, observations_qos())
+
+    def diagnose(self) -> list[Status]:
+        """Return the latencies of every fluoroscope."""
+        return [
+            Status(name, OK, '', latencies.values()) for name, latencies in self._latencies.items()
+        ]
 
     def _relay(self, name: str) -> Callable[[TargetObservations, dict[str, Any]], None]:
         publisher = self.create_publisher(
@@ -75,13 +65,8 @@ class Relay(ManagedNode):
 
         return relay
 
-    def deactivate(self) -> None:
-        """Stop relaying."""
-        if self._reader is not None:
-            self._reader.stop()
 
-
-def all_fatal(node: ManagedNode) -> FaultHandlers:
+def all_fatal(node: StreamNode) -> FaultHandlers:
     """Return handlers that end a benchmark's node at any fault."""
     return FaultHandlers(
         node.fail, lambda topic, error: node.fail(f'{topic}: {error!r}'), node.fail

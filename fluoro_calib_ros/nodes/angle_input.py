@@ -68,9 +68,9 @@ class AngleInput:
                 observations_qos(),
                 decode=decode_joint_state,
                 max_bytes=MEGABYTE,
+                # Before frames, so that a queued one does not get the angle of an earlier one.
+                first=self._faults(faults),
             )
-            # Joint states first, so that a queued frame does not get the angle of an earlier one.
-            reader.take_first(TOPIC, self._faults(faults))
         return reader
 
     def _faults(self, faults: FaultHandlers) -> FaultHandlers:

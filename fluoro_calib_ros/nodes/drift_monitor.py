@@ -17,6 +17,7 @@ from rclpy.publisher import Publisher
 from ..bodies.body import Body, declared_bodies
 from ..checks.drift_charts import DriftOptions, DriftState
 from ..checks.rig_watch import RigDriftWatch
+from ..errors import ErrorsAt
 from ..findings import Finding
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -52,14 +53,12 @@ class DriftParameters:
     )
 
     def __post_init__(self) -> None:
-        try:
-            self.rigid_bodies()
-        except ValueError as error:
-            raise ValueError(f'clusters: {error}') from None
+        self.rigid_bodies()
 
     def rigid_bodies(self) -> tuple[Body, ...]:
-        """Return the declared bodies. Raises ValueError for a text that declares none."""
-        return declared_bodies([text for text in self.clusters if text])
+        """Return the declared bodies. Raises DataError for a text that declares none."""
+        with ErrorsAt('clusters'):
+            return declared_bodies(filter(None, self.clusters))
 
 
 class DriftMonitor:

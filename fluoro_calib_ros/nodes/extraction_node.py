@@ -20,7 +20,7 @@ from fluoro_calib_msgs.msg import Retraction, TargetObservations
 from sensor_msgs.msg import CompressedImage, Image
 
 from ..bodies.body import Body, declared_bodies
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame
 from ..exposures.pairing import PairingOptions
@@ -125,16 +125,13 @@ class ExtractionParameters(ManagedParameters):
     )
 
     def __post_init__(self) -> None:
-        try:
-            self.rigid_bodies()
-        except ValueError as error:
-            raise ValueError(f'clusters: {error}') from None
         if self.bodies and self.rigid_bodies():
             raise ValueError('bodies: the file names the markers of each body, as clusters do')
 
     def rigid_bodies(self) -> tuple[Body, ...]:
-        """Return the declared bodies. Raises ValueError for a text that declares none."""
-        return declared_bodies([text for text in self.clusters if text])
+        """Return the declared bodies. Raises DataError for a text that declares none."""
+        with ErrorsAt('clusters'):
+            return declared_bodies(filter(None, self.clusters))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -76,16 +76,34 @@ class PointsCounter:
         }
 
 
+Forms = Mapping[str, tuple[type, Callable[..., Any]]]
+
+
+def _output(node: StreamNode, kind: type, name: str) -> Publisher:
+    """Create the publisher of a topic below reconstruction/, or of one that begins with a /."""
+    topic = name if name.startswith('/') else f'reconstruction/{name}'
+    return node.create_output(kind, topic, observations_qos())
+
+
+def _outputs(node: StreamNode, forms: Forms) -> list[tuple[Publisher, Callable[..., Any]]]:
+    """Create publishers of message types by name; return each with the maker of its messages."""
+    return [(_output(node, kind, name), make) for name, (kind, make) in forms.items()]
+
+
+def _publish(forms: Iterable[tuple[Publisher, Callable[..., Any]]], *content: Any) -> None:
+    """Publish the forms that have subscribers."""
+    for publisher, make in forms:
+        if publisher.get_subscription_count():
+            publisher.publish(make(*content))
+
+
 class PointsOutput:
     """Publishers of reconstructed points."""
 
     def __init__(self, node: StreamNode) -> None:
-        def output(kind: type, name: str) -> Publisher:
-            return node.create_output(kind, f'reconstruction/{name}', observations_qos())
-
-        self._points = output(ReconstructedPoints, 'points_with_covariance')
-        self._ellipsoids = output(MarkerArray, 'markers')
-        self._forms = [(output(kind, name), make) for name, (kind, make) in POINT_FORMS.items()]
+        self._points = _output(node, ReconstructedPoints, 'points_with_covariance')
+        self._ellipsoids = _output(node, MarkerArray, 'markers')
+        self._forms = _outputs(node, POINT_FORMS)
         self._ellipsoids_published_ns = 0
 
     def publish(self, content: PointsContent, sigmas: float, rate_hz: float) -> None:
@@ -118,23 +136,13 @@ class BodiesOutput:
     def __init__(
         self, node: StreamNode, names: Sequence[str], has_joints: bool, rig_frame: str
     ) -> None:
-        def output(kind: type, topic: str) -> Publisher:
-            return node.create_output(kind, topic, observations_qos())
-
-        self._bodies = output(BodyPoses, 'reconstruction/body_poses')
-        self._joints = output(JointAngles, 'reconstruction/joint_angles') if has_joints else None
-        forms: dict[str, tuple[type, Any]] = {
-            '/tf': (TFMessage, partial(transforms_of_bodies, parent=rig_frame)),
-            **{f'reconstruction/{name}': form for name, form in FORMS.items()},
-        }
-        if has_joints:
-            forms['reconstruction/joint_states'] = JointState, joint_state
-        self._forms = [(output(kind, topic), make) for topic, (kind, make) in forms.items()]
+        self._bodies = _output(node, BodyPoses, 'body_poses')
+        self._joints = _output(node, JointAngles, 'joint_angles') if has_joints else None
+        transforms = partial(transforms_of_bodies, parent=rig_frame)
+        joint_forms = {'joint_states': (JointState, joint_state)} if has_joints else {}
+        self._forms = _outputs(node, {'/tf': (TFMessage, transforms), **FORMS, **joint_forms})
         self._forms_of_bodies = [
-            [
-                (output(kind, f'reconstruction/bodies/{name}/{form}'), make)
-                for form, (kind, make) in BODY_FORMS.items()
-            ]
+            _outputs(node, {f'bodies/{name}/{form}': made for form, made in BODY_FORMS.items()})
             for name in names
         ]
         self.retractions = BodyRetractions(self.publish_own)  #: of the published poses
@@ -142,13 +150,9 @@ class BodiesOutput:
     def publish(self, content: BodiesContent) -> None:
         """Publish an exposure; standard message types only while they have subscribers."""
         message = self.publish_own(content)
-        for publisher, make in self._forms:
-            if publisher.get_subscription_count():
-                publisher.publish(make(content, message))
+        _publish(self._forms, content, message)
         for row in content.measured:
-            for publisher, make in self._forms_of_bodies[row]:
-                if publisher.get_subscription_count():
-                    publisher.publish(make(content, message, row))
+            _publish(self._forms_of_bodies[row], content, message, row)
         self.retractions.note(content)
 
     def publish_own(self, content: BodiesContent) -> BodyPoses:

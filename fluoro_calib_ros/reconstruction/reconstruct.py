@@ -50,20 +50,13 @@ class CorrectedView:
         return cls(target_id, np.array([u, v]).T, sigma, correction_sd, outside)
 
 
-@dataclass(frozen=True)
-class MatchedViews:
+class MatchedViews(CorrectedView):
     """Corrected image points of F views of an exposure, by target.
 
-    If a view does not see a target, values are NaN, and `outside` is False.
+    Arrays are (F, n, ...), apart from target_id (n,): ascending, or in the common order if all
+    views have the same ids in the same order. If a view does not see a target, values are NaN, and
+    `outside` is False.
     """
-
-    #: (n,) ascending; in the common order if all views have the same ids in the same order
-    target_id: NDArray[np.integer]
-    uv: NDArray[np.float64]  #: (F, n, 2) corrected pixels
-    #: (F, n) standard deviations of the coordinates, and of the correction alone [px]
-    sigma: NDArray[np.float64]
-    correction_sd: NDArray[np.float64]
-    outside: NDArray[np.bool_]  #: (F, n) True beyond the calibrated area
 
 
 def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:

@@ -301,10 +301,10 @@ def test_states_are_taken_before_each_image_that_waits(graph):
             topic,
             lambda message, _, topic=topic: heard.append((topic, message.name[0])),
             QoSProfile(depth=10),
+            first=faults if topic == 'first' else None,
         )
         outputs[topic] = client.create_publisher(JointState, topic, QoSProfile(depth=10))
         client.wait_until(outputs[topic].get_subscription_count, what=topic)
-    reader.take_first('first', faults)
     for number in range(3):
         outputs['slow'].publish(JointState(name=[f'{number}']))
         outputs['first'].publish(JointState(name=[f'{number}']))

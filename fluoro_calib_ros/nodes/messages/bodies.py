@@ -26,10 +26,9 @@ from ...bodies import body as of_bodies
 from ...bodies.body import AXIS_MM, Body, PoseStatus
 from ...bodies.joints import JointMotion, JointStatus
 from ...photogrammetry.rig_orientation import RigOrientation
-from ...photogrammetry.rotations import quaternion_from_matrix
 from .observations import float64_field, stamp_from_nanoseconds, uint8_field, uint32_field
 from .points import GREEN, LIFETIME_NS, YELLOW
-from .rig_orientation import pose_of, transform_of
+from .rig_orientation import pose_of, set_poses, transform_of
 
 try:
     from mocap4r2_msgs import msg as mocap
@@ -82,12 +81,11 @@ def message_from_bodies(content: BodiesContent) -> BodyPoses:
     poses = content.poses
     message = BodyPoses(header=content.header(), frame_number=content.frame_number)
     message.body = [pose.body for pose in poses]
-    position = np.array([pose.position_mm[0] for pose in poses]) / 1000
-    attitude = quaternion_from_matrix(np.array([pose.rotation[0] for pose in poses]))
-    for name, column in zip(('x', 'y', 'z'), position.T):
-        setattr(message, name, float64_field(column))
-    for name, column in zip(('qw', 'qx', 'qy', 'qz'), attitude.T):
-        setattr(message, name, float64_field(column))
+    set_poses(
+        message,
+        np.array([pose.position_mm[0] for pose in poses]),
+        np.array([pose.rotation[0] for pose in poses]),
+    )
     message.covariance = float64_field(np.array([pose.covariance[0] for pose in poses]) * _SCALE)
     message.status = uint8_field([pose.status[0] for pose in poses])
     message.markers = uint32_field([pose.markers[0] for pose in poses])

@@ -44,16 +44,30 @@ def transforms_of_orientation(
     a frame at its calibrated pose is inserted between it and the rig frame (REP 105: like odom
     between map and robot).
     """
-    if calibrated is not None:
-        return _with_corrections(message, rig_frame, calibrated)
     stamp = message.header.stamp
     frame = message.header.frame_id
+    frames = message.optical_frame_id
     out = TFMessage()
-    if frame != rig_frame and frame not in message.optical_frame_id:
+    if frame != rig_frame and frame not in frames:
         out.transforms.append(transform_of(stamp, rig_frame, frame, Pose()))
-    for row, child in enumerate(message.optical_frame_id):
-        if child != rig_frame:
-            out.transforms.append(transform_of(stamp, rig_frame, child, pose_of(message, row)))
+    before, moved = RigOrientation(), set()
+    if calibrated is not None:
+        before = message_from_orientation(calibrated)
+        after = content_of_orientation(message)
+        moved = {child for row, child in enumerate(frames) if _moved_by(calibrated, after, row)}
+    corrected = []
+    for row, child in enumerate(frames):
+        if child == rig_frame:
+            continue
+        parent = rig_frame
+        pose = pose_of(message, row)
+        if child in moved and child in before.optical_frame_id:
+            parent = f'{child}{AS_CALIBRATED}'
+            old = pose_of(before, before.optical_frame_id.index(child))
+            corrected.append(transform_of(before.header.stamp, rig_frame, parent, old))
+            pose = _relative_pose(old, pose)
+        out.transforms.append(transform_of(stamp, parent, child, pose))
+    out.transforms += corrected
     return out
 
 
@@ -67,6 +81,17 @@ def pose_of(message: RigOrientation | BodyPoses, row: int) -> Pose:
     return pose
 
 
+def set_poses(
+    message: RigOrientation | BodyPoses,
+    position_mm: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+) -> None:
+    """Set the arrays x, y, z, qx, qy, qz and qw of a message to poses (n, 3), (n, 3, 3)."""
+    columns = (*(position_mm / 1000).T, *quaternion_from_matrix(rotation).T)
+    for name, column in zip((*_POSITION, *_ATTITUDE), columns):
+        setattr(message, name, float64_field(column))
+
+
 def transform_of(stamp: Time, parent: str, child: str, pose: Pose) -> TransformStamped:
     """Return the transform of a frame with a pose in its parent."""
     stamped = TransformStamped(header=Header(stamp=stamp, frame_id=parent), child_frame_id=child)
@@ -76,43 +101,21 @@ def transform_of(stamp: Time, parent: str, child: str, pose: Pose) -> TransformS
     return stamped
 
 
-def _with_corrections(
-    message: RigOrientation, rig_frame: str, calibrated: rig.RigOrientation
-) -> TFMessage:
-    """Return the transforms of a healed orientation, with frames at the calibrated poses."""
-    out = transforms_of_orientation(message, rig_frame)
-    before = transforms_of_orientation(message_from_orientation(calibrated), rig_frame)
-    earlier = {tf.child_frame_id: tf for tf in before.transforms}
-    moved = rig_change(calibrated, content_of_orientation(message))
-    for healed in list(out.transforms):
-        child = healed.child_frame_id
-        if child not in moved or child not in earlier:
-            continue
-        old = earlier[child]
-        old.child_frame_id = healed.header.frame_id = f'{child}{AS_CALIBRATED}'
-        out.transforms.append(old)
-        (p0, r0), (p1, r1) = (_pose_of(tf) for tf in (old, healed))
-        place, turn = r0.T @ (p1 - p0), quaternion_from_matrix(r0.T @ r1)
-        for target, names, values in (
-            (healed.transform.translation, 'xyz', place),
-            (healed.transform.rotation, 'wxyz', turn),
-        ):
-            for name, value in zip(names, values.tolist()):
-                setattr(target, name, value)
+def _relative_pose(old: Pose, new: Pose) -> Pose:
+    """Return a new pose relative to an old one."""
+    (p0, r0), (p1, r1) = map(_place_and_rotation, (old, new))
+    out = Pose()
+    for target, names, values in (
+        (out.position, 'xyz', r0.T @ (p1 - p0)),
+        (out.orientation, 'wxyz', quaternion_from_matrix(r0.T @ r1)),
+    ):
+        for name, value in zip(names, values.tolist()):
+            setattr(target, name, value)
     return out
 
 
-def rig_change(before: rig.RigOrientation, after: rig.RigOrientation) -> dict[str, str]:
-    """Return how far optical frames have moved between orientations, as text by frame name."""
-    return {
-        after.optical_frame_ids[f]: text
-        for f, name in enumerate(after.fluoroscopes)
-        if (text := _moved_by(before, after, name))
-    }
-
-
-def _pose_of(stamped: TransformStamped) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    place, turn = stamped.transform.translation, stamped.transform.rotation
+def _place_and_rotation(pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    place, turn = pose.position, pose.orientation
     rotation = matrix_from_quaternion(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]
     return np.array([place.x, place.y, place.z]), rotation
 
@@ -134,14 +137,9 @@ def message_from_orientation(orientation: rig.RigOrientation) -> RigOrientation:
     message.calibration_id = list(orientation.calibration_ids)
     message.optical_frame_id = list(orientation.optical_frame_ids)
     message.exposures = orientation.exposures
-    attitude = quaternion_from_matrix(orientation.rotation.transpose(0, 2, 1))
-    for names, columns in (
-        (_INTERIOR, orientation.interior.T),
-        (_POSITION, orientation.position_mm.T / 1000),
-        (_ATTITUDE, attitude.T),
-    ):
-        for name, column in zip(names, columns):
-            setattr(message, name, float64_field(column))
+    for name, column in zip(_INTERIOR, orientation.interior.T):
+        setattr(message, name, float64_field(column))
+    set_poses(message, orientation.position_mm, orientation.rotation.transpose(0, 2, 1))
     scale = _metre_scale(len(orientation.fluoroscopes))
     message.covariance = float64_field(orientation.covariance * scale * scale[:, None])
     return message
@@ -215,15 +213,19 @@ def jump_text(before: rig.RigOrientation, after: rig.RigOrientation) -> str:
     """Return how far fluoroscopes have moved between orientations, '' if none has."""
     if before.frame_id != after.frame_id:
         return f'the rig frame is {after.frame_id} instead of {before.frame_id}'
-    texts = ((name, _moved_by(before, after, name)) for name in after.fluoroscopes)
+    texts = ((name, _moved_by(before, after, f)) for f, name in enumerate(after.fluoroscopes))
     return ', '.join(f'{name} by {text}' for name, text in texts if text)
 
 
-def _moved_by(before: rig.RigOrientation, after: rig.RigOrientation, name: str) -> str:
-    """Return how far a fluoroscope has moved between orientations, '' if it has not."""
+def _moved_by(before: rig.RigOrientation, after: rig.RigOrientation, row: int) -> str:
+    """Return how far a fluoroscope has moved between orientations, '' if it has not.
+
+    row: of the fluoroscope in the later orientation.
+    """
+    name = after.fluoroscopes[row]
     if name not in before.fluoroscopes:
         return ''
-    f_before, f_after = before.index(name), after.index(name)
+    f_before, f_after = before.index(name), row
     shift = np.linalg.norm(after.position_mm[f_after] - before.position_mm[f_before])
     turn = np.linalg.norm(
         vector_from_matrix(after.rotation[f_after] @ before.rotation[f_before].T)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Managed nodes and the common parts of nodes that process streams."""
+"""Base of the managed nodes, which process streams."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ from .streams import FaultHandlers, StreamReader
 from .topics import qos_overrides
 
 T = TypeVar('T')
-Step = Callable[[], None]
 
 
-class ManagedNode(ParameterNode, LifecycleNode):
-    """Lifecycle node that configures and activates itself, unless autostart is false.
+class StreamNode(ParameterNode, LifecycleNode):
+    """Lifecycle node with outputs and stream readers, which publishes diagnostics once a second.
 
-    Subclasses override configure(), activate(), deactivate() and cleanup(). The last two must work
-    in every state. A transition that raises is logged, which rclpy would not do, and undone; after
-    a failed deactivate() or cleanup(), everything is cleaned up.
+    It configures and activates itself, unless autostart is false. Subclasses override
+    create_outputs(), create_readers(), diagnose() and reset(). deactivate() and cleanup() must
+    work in every state. A transition that raises is logged, which rclpy would not do, and undone;
+    after a failed deactivate() or cleanup(), everything is cleaned up.
     """
 
     def __init__(self, name: str) -> None:
@@ -53,97 +53,6 @@ class ManagedNode(ParameterNode, LifecycleNode):
         self.autostart = True
         self._starting = False
         self._fault = ''
-
-    def configure(self) -> None:
-        """Create outputs and slow inputs."""
-
-    def activate(self) -> None:
-        """Start to process streams."""
-
-    def deactivate(self) -> None:
-        """Stop processing streams."""
-
-    def cleanup(self) -> None:
-        """Destroy everything that configure() created."""
-
-    def bring_up(self) -> None:
-        """Configure and activate the node if autostart is set. Raises StartError."""
-        if not self.autostart:
-            return
-        self._starting = True
-        for trigger in (self.trigger_configure, self.trigger_activate):
-            if trigger() != TransitionCallbackReturn.SUCCESS:
-                raise StartError(self._fault)
-        self._starting = False
-
-    def stop(self) -> None:
-        """Deactivate and clean up before the node is destroyed."""
-        self._try(self.deactivate)
-        self._try(self.cleanup)
-
-    def destroy_node(self) -> None:
-        """Destroy the node and its state machine, which would keep it in the graph."""
-        super().destroy_node()
-        self._state_machine.destroy_when_not_in_use()
-
-    def destroy_publisher(self, publisher: Publisher) -> bool:
-        """Destroy a publisher, possibly a lifecycle publisher."""
-        return self.destroy_lifecycle_publisher(publisher)
-
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run configure(); undo it if it fails."""
-        return self._try(self.configure, self.cleanup)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run activate(); undo it if it fails."""
-        super().on_activate(state)
-        result = self._try(self.activate, self.deactivate)
-        if result != TransitionCallbackReturn.SUCCESS:
-            super().on_deactivate(state)
-        return result
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run deactivate()."""
-        result = self._try(self.deactivate)
-        super().on_deactivate(state)
-        return result
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run cleanup()."""
-        return self._try(self.cleanup)
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Clean up after a transition that could not be undone; the node is unconfigured then."""
-        return self._try(self.cleanup)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Deactivate and clean up."""
-        self.stop()
-        return TransitionCallbackReturn.SUCCESS
-
-    def _try(self, function: Step, undo: Step | None = None) -> TransitionCallbackReturn:
-        try:
-            function()
-        except Exception as error:
-            is_user_error = isinstance(error, USER_ERRORS)
-            self._fault = one_line(error) if is_user_error else Trace(traceback.format_exc())
-            if not self._starting:  # otherwise the main loop logs it
-                self.get_logger().error(self._fault)
-            if undo is None:
-                return TransitionCallbackReturn.ERROR
-            undo()
-            return TransitionCallbackReturn.FAILURE
-        return TransitionCallbackReturn.SUCCESS
-
-
-class StreamNode(ManagedNode):
-    """Managed node with outputs and stream readers, which publishes diagnostics once a second.
-
-    Subclasses override create_outputs(), create_readers(), diagnose() and reset().
-    """
-
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
         self.limited_logger = RateLimitedLogger(self.get_logger())
         self.readers: list[StreamReader] = []
         self._resources = ExitStack()
@@ -273,6 +182,79 @@ class StreamNode(ManagedNode):
         self._resources.close()
         self.recent = RecentCounts()
         self.reset()
+
+    # -- transitions
+
+    def bring_up(self) -> None:
+        """Configure and activate the node if autostart is set. Raises StartError."""
+        if not self.autostart:
+            return
+        self._starting = True
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() != TransitionCallbackReturn.SUCCESS:
+                raise StartError(self._fault)
+        self._starting = False
+
+    def stop(self) -> None:
+        """Deactivate and clean up before the node is destroyed."""
+        self._try(self.deactivate)
+        self._try(self.cleanup)
+
+    def destroy_node(self) -> None:
+        """Destroy the node and its state machine, which would keep it in the graph."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
+    def destroy_publisher(self, publisher: Publisher) -> bool:
+        """Destroy a publisher, possibly a lifecycle publisher."""
+        return self.destroy_lifecycle_publisher(publisher)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run configure(); undo it if it fails."""
+        return self._try(self.configure, self.cleanup)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run activate(); undo it if it fails."""
+        super().on_activate(state)
+        result = self._try(self.activate, self.deactivate)
+        if result != TransitionCallbackReturn.SUCCESS:
+            super().on_deactivate(state)
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run deactivate()."""
+        result = self._try(self.deactivate)
+        super().on_deactivate(state)
+        return result
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run cleanup()."""
+        return self._try(self.cleanup)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Clean up after a transition that could not be undone; the node is unconfigured then."""
+        return self._try(self.cleanup)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Deactivate and clean up."""
+        self.stop()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _try(
+        self, function: Callable[[], None], undo: Callable[[], None] | None = None
+    ) -> TransitionCallbackReturn:
+        try:
+            function()
+        except Exception as error:
+            is_user_error = isinstance(error, USER_ERRORS)
+            self._fault = one_line(error) if is_user_error else Trace(traceback.format_exc())
+            if not self._starting:  # otherwise the main loop logs it
+                self.get_logger().error(self._fault)
+            if undo is None:
+                return TransitionCallbackReturn.ERROR
+            undo()
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
 
 
 # Counts of the stream of one fluoroscope.

@@ -90,12 +90,15 @@ class _ReaderGroup(CallbackGroup):
 
 
 class _Route(NamedTuple):
-    """A subscription, the decoder of its messages, and their callback."""
+    """A subscription, and what is done with its messages."""
 
     topic: str
     subscription: Subscription
     decode: Callable[..., Any]
     callback: Callable[..., Any]
+    max_bytes: int
+    faults: FaultHandlers
+    is_first: bool  #: whether its pending messages are handled before each one of the others
     is_overridden: bool  #: whether the user has chosen another reliability
 
     @property
@@ -137,11 +140,8 @@ class StreamReader:
         self._node = node
         self._faults = faults
         self._adaptation = adaptation
-        self._faults_of: dict[str, FaultHandlers] = {}  # of topics with their own handlers
         self._group = _ReaderGroup()
         self._routes: list[_Route] = []
-        self._max_bytes: dict[str, int] = {}  # by topic
-        self._first: set[str] = set()  # topics of take_first()
         # number of the last message by topic, and of its publishers when it was last irregular
         self._sequence: dict[str, tuple[int, int]] = {}
         self._stopping = threading.Event()
@@ -155,6 +155,7 @@ class StreamReader:
         qos: QoSProfile,
         decode: Callable[[bytes], Any] | None = None,
         max_bytes: int | None = None,
+        first: FaultHandlers | None = None,
     ) -> None:
         """Subscribe to a topic, also while messages are being received.
 
@@ -172,13 +173,23 @@ class StreamReader:
             dropped and counted as such. By default, the deserialisation of ROS.
         max_bytes : int, optional
             Larger messages are dropped before they are decoded; by default the limit for images.
+        first : FaultHandlers, optional
+            Handlers of a topic whose pending messages are handled before each one of the others.
         """
         requested = qos.reliability
         subscription = self._subscription(kind, topic, qos, qos_overrides())
-        is_overridden = subscription.qos_profile.reliability != requested
-        self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
-        decode = decode or (lambda data: deserialize_message(data, kind))
-        self._routes.append(_Route(topic, subscription, decode, callback, is_overridden))
+        self._routes.append(
+            _Route(
+                topic,
+                subscription,
+                decode or (lambda data: deserialize_message(data, kind)),
+                callback,
+                max_bytes=max_bytes or read_limits().max_image_bytes,
+                faults=first or self._faults,
+                is_first=first is not None,
+                is_overridden=subscription.qos_profile.reliability != requested,
+            )
+        )
 
     def _subscription(
         self,
@@ -198,17 +209,6 @@ class StreamReader:
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )
 
-    def take_first(self, topic: str, faults: FaultHandlers) -> None:
-        """Handle pending messages of a subscribed topic before each message of the others.
-
-        faults: handlers of this topic.
-        """
-        self._first.add(topic)
-        self._faults_of[topic] = faults
-
-    def _of(self, topic: str) -> FaultHandlers:
-        return self._faults_of.get(topic, self._faults)
-
     def topics(self) -> dict[str, bool]:
         """Return whether each subscribed topic (relative name) has a publisher."""
         return {
@@ -222,10 +222,9 @@ class StreamReader:
         To be called from the thread that created the subscriptions.
         """
         renewed = {}
-        for number, (_, subscription, *_, is_overridden) in enumerate(self._routes):
-            publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
-            qos = self._adaptation(subscription.qos_profile, publishers)
-            if differs(qos, subscription.qos_profile) and not is_overridden:
+        for number, route in enumerate(self._routes):
+            qos = self._adaptation(route.subscription.qos_profile, self._publishers(route))
+            if differs(qos, route.subscription.qos_profile) and not route.is_overridden:
                 renewed[number] = qos
         if not renewed:
             return
@@ -246,15 +245,18 @@ class StreamReader:
         Keys are the topics as passed to subscribe(), without namespace and remapping.
         """
         messages = {}
-        for topic, subscription, *_ in self._routes:
-            for publisher in self._node.get_publishers_info_by_topic(subscription.topic_name):
+        for route in self._routes:
+            for publisher in self._publishers(route):
                 result, reason = qos_check_compatible(
-                    publisher.qos_profile, subscription.qos_profile
+                    publisher.qos_profile, route.subscription.qos_profile
                 )
                 if result == QoSCompatibility.ERROR:
                     reason = reason.removeprefix('ERROR: ').strip(' ;.').lower()
-                    messages[topic] = incompatible_qos_message(topic, reason)
+                    messages[route.topic] = incompatible_qos_message(route.topic, reason)
         return messages
+
+    def _publishers(self, route: _Route) -> Sequence[TopicEndpointInfo]:
+        return self._node.get_publishers_info_by_topic(route.subscription.topic_name)
 
     def start(self) -> None:
         """Start receiving; to be called from the thread that created the subscriptions."""
@@ -314,17 +316,9 @@ class StreamReader:
             for route in routes.values():
                 wait_set.add_subscription(route.handle)
             wait_set.wait(WAIT_NS)
-            first = [route for route in routes.values() if route.topic in self._first]
+            first = [route for route in routes.values() if route.is_first]
             for pointer in wait_set.get_ready_entities('subscription'):
                 self._drain(routes[pointer], first, MAX_BATCH)
-
-    def _drop(self, topic: str, size: int) -> None:
-        """Report a message that is too large."""
-        faults = self._of(topic)
-        if faults.too_large is None:
-            faults.undecodable(topic)
-        else:
-            faults.too_large(topic, size)
 
     def _drain(self, route: _Route, first: list[_Route], most: int) -> None:
         """Handle at most `most` pending messages of a subscription.
@@ -346,7 +340,7 @@ class StreamReader:
 
     def _count_overrun(self, route: _Route, number: int | None) -> None:
         """Count the missing messages before the one with the given sequence number."""
-        faults = self._of(route.topic)
+        faults = route.faults
         if faults.overrun is None or number is None or route.is_latched:
             return
         last, before = self._sequence.get(route.topic, (number, 0))
@@ -359,19 +353,19 @@ class StreamReader:
             faults.overrun(route.topic, lost)
 
     def _handle(self, route: _Route, data: bytes, info: dict[str, Any]) -> None:
-        if len(data) > self._max_bytes[route.topic]:
-            self._drop(route.topic, len(data))
-            return
+        faults = route.faults
         try:
+            if len(data) > route.max_bytes:
+                raise TooLarge
             message = route.decode(data)
-        except TooLarge:
-            self._drop(route.topic, len(data))
-            return
-        except DECODING_ERRORS:
-            self._of(route.topic).undecodable(route.topic)
+        except DECODING_ERRORS as error:
+            if isinstance(error, TooLarge) and faults.too_large is not None:
+                faults.too_large(route.topic, len(data))
+            else:
+                faults.undecodable(route.topic)
             return
         try:
             route.callback(message, info)
         except Exception as error:  # only this message is lost
             if not self._stopping.is_set() and self._node.context.ok():
-                self._of(route.topic).callback_error(route.topic, error)
+                faults.callback_error(route.topic, error)

@@ -37,7 +37,7 @@ from fluoro_calib_ros.nodes.runtime.topics import (
 from fluoro_calib_ros.options import option
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
-from .relay import all_fatal
+from .relay import RelaySettings, all_fatal
 
 DIFFERENT = 8  # distinct images, published in turn
 
@@ -107,7 +107,7 @@ class Relay(StreamNode):
     """Republishes every image of a/image_raw on a/relayed."""
 
     def __init__(self) -> None:
-        super().__init__('relay')
+        super().__init__('relay', RelaySettings)
 
     def create_readers(self) -> None:
         """Start to relay."""

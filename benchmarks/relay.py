@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from fluoro_calib_msgs.msg import TargetObservations
@@ -19,15 +20,23 @@ from fluoro_calib_msgs.msg import TargetObservations
 from fluoro_calib_ros.nodes.runtime.diagnostics import OK, LatencyWindow, Status
 from fluoro_calib_ros.nodes.runtime.lifecycle import StreamNode
 from fluoro_calib_ros.nodes.runtime.main import run
+from fluoro_calib_ros.nodes.runtime.parameters import ManagedParameters, group
 from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers
 from fluoro_calib_ros.nodes.runtime.topics import observations_qos
+
+
+@dataclass(frozen=True)
+class RelaySettings:
+    """Parameter values by group."""
+
+    node: ManagedParameters = group(ManagedParameters)
 
 
 class Relay(StreamNode):
     """Republishes <fluoroscope>/target_observations on <fluoroscope>/relayed_KIND."""
 
     def __init__(self, kind: str) -> None:
-        super().__init__(f'relay_{kind}')
+        super().__init__(f'relay_{kind}', RelaySettings)
         self._kind = kind
         self._latencies = {name: LatencyWindow() for name in 'ab'}
 

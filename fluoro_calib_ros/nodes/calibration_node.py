@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache, partial
 
-from fluoro_calib_msgs.msg import DriftStatus, TargetObservations
+from fluoro_calib_msgs.msg import DriftStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
@@ -43,14 +43,13 @@ from .exposure_input import (
     NodeParts,
     PhantomStream,
 )
-from .frame_validation import with_limit
+from .frame_validation import subscribe_frames
 from .healing_services import Healing
-from .messages.observations import ObservedFrame, decode_target_observations
+from .messages.observations import ObservedFrame
 from .runtime.conditions import health_of, state_of
 from .runtime.diagnostics import RefusalLog, Status
 from .runtime.lifecycle import StreamNode, stream_faults
 from .runtime.main import run
-from .runtime.parameters import declare_groups, declare_read_limits, follow_groups
 from .runtime.services import Requests, create_services, wake
 from .runtime.topics import observations_qos
 from .shape_learning import ShapeLearning
@@ -64,30 +63,25 @@ class CalibrationNode(StreamNode):
     """Collects exposures of the fluoroscopes, and runs one self-calibration at a time."""
 
     def __init__(self) -> None:
-        super().__init__('calibration_node')
-        declare_read_limits(self)
-        self._settings = declare_groups(self, CalibrationSettings)
-        self.autostart = self._settings.node.autostart
-        self._rig = read_rig(self, lambda: self._settings)
+        super().__init__('calibration_node', CalibrationSettings)
+        self._rig = read_rig(self, lambda: self.settings)
         self._requests = Requests()
         self.reset()
-        follow_groups(self, lambda: self._settings, self._use)
 
     def reset(self) -> None:
         """Discard exposures and angles, and reset all counters."""
-        names = self._rig.names
-        self._angles = AngleInput(self._settings.angles, names, self.limited_logger)
+        self._angles = AngleInput(self.settings.angles, self.names, self.limited_logger)
         self._exposures = ExposureInput(
-            names,
+            self.names,
             self._rig.phantom,
-            self._settings,
+            self.settings,
             on_captured=partial(wake, self),
             logger=self.get_logger(),
         )
 
-    def _use(self, settings: CalibrationSettings) -> None:
+    def use(self, settings: CalibrationSettings) -> None:
         """Apply new settings from now on."""
-        self._settings = settings
+        super().use(settings)
         self._exposures.use(settings)
 
     # -- lifecycle
@@ -121,7 +115,7 @@ class CalibrationNode(StreamNode):
             self.own(action, action.destroy)
             self.own(job, job.end)
         self.own(self._learning, self._learning.end)
-        if self._settings.node.learn_bodies:
+        if self.settings.node.learn_bodies:
             topic, callback = 'reconstruction/drift', self._learning.on_drift
             refusals = RefusalLog(topic, self.limited_logger)
             self.create_input(DriftStatus, topic, callback, observations_qos(), refusals)
@@ -136,15 +130,7 @@ class CalibrationNode(StreamNode):
         """Receive the observations of all fluoroscopes in one thread."""
         faults = stream_faults(self._exposures.streams, self.fail)
         reader = self._angles.create_reader(self, faults)
-        for name in self._rig.names:
-            reader.subscribe(
-                TargetObservations,
-                f'{name}/{OBSERVATIONS}',
-                partial(self._on_frame, name),
-                observations_qos(),
-                decode=with_limit(decode_target_observations, self._settings.limits.max_points),
-                max_bytes=self._settings.limits.max_bytes,
-            )
+        subscribe_frames(reader, self, OBSERVATIONS, self._on_frame)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Clean up, unless a request is being answered."""
@@ -168,7 +154,7 @@ class CalibrationNode(StreamNode):
 
     def _on_frame(self, name: str, frame: ObservedFrame, _: Mapping[str, int]) -> None:
         stamp_ns = nanoseconds_from_stamp(frame)
-        needed = bool(self._settings.angles.angle_joint)
+        needed = bool(self.settings.angles.angle_joint)
 
         @cache  # asked for by each part that needs it, and counted once
         def angle() -> float | None:

@@ -28,7 +28,6 @@ from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
 from ..jobs.orientation import OrientationOutcome, orient
 from ..jobs.result_folder import RESULT_FOLDER, belongs_to
 from ..processes import in_worker_process
-from .calibration_settings import NOT_ACTIVE
 from .exposure_input import NodeParts, RigServices
 from .messages.self_calibration import (
     Request,
@@ -87,11 +86,8 @@ class OrientationService(RigServices):
         most = self._rig.settings().limits.max_exposures
         if request.frames > most:
             raise DataError(f'frames must be at most {most} (max_exposures), not {request.frames}')
-        if not self._node.readers:
-            raise DataError(NOT_ACTIVE)
-        missing = [name for name in names if name not in self._output.calibrations]
-        if missing:
-            raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
+        self._check_active()
+        self._all_calibrations()
         frames = await self._captured(names, request.frames or 1, timeout)
         calibrations = self._output.calibrations
         present_orientation = self._output.orientation

@@ -43,17 +43,15 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration_output import CalibrationOutput
 from .runtime.diagnostics import Logger, StartError
 from .runtime.parameters import (
-    READ_LIMITS,
     ManagedParameters,
     ParameterNode,
     check_frame,
     expand_path,
     group,
-    groups_of,
+    parameters_of_managed,
 )
 from .runtime.services import telling_service
 
-NOT_ACTIVE = 'the node is not active, so no frames come in'
 COLLECT_MODES = ('still', 'request')
 MAX_HEAL_S = 60.0  # maximum collection time of heal: changes show within a few seconds
 
@@ -154,7 +152,7 @@ class CalibrationSettings:
     limits: CollectLimits = group(CollectLimits)
 
 
-PARAMETERS = (*groups_of(CalibrationSettings).values(), READ_LIMITS)
+PARAMETERS = parameters_of_managed(CalibrationSettings)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 from ..correction.angle_field import AngleField
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, printable
-from ..exposures.angles import AngleOptions
 from ..io.calibration import SUFFIX, disagreements, load_calibrations
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
@@ -20,10 +19,9 @@ from .runtime import conditions
 from .runtime.conditions import StreamState, health_of, healthy, state_of, warns
 from .runtime.diagnostics import WARN, Health, RefusalLog, Status, one_line
 from .runtime.lifecycle import Stream, StreamNode
-from .runtime.parameters import ParameterGroup, declare_read_limits, expand_path
+from .runtime.parameters import expand_path
 
 FILES = f'*{SUFFIX}'
-ANGLES = ParameterGroup(AngleOptions)
 
 
 @dataclass
@@ -103,20 +101,14 @@ class CorrectingNode(StreamNode):
     beyond: ClassVar[str] = ''
     stream_kind: ClassVar[type[CorrectedStream]] = CorrectedStream
     topics: tuple[str, ...] = ()  #: subscribed topics, relative to each fluoroscope
-    parameters: ClassVar[ParameterGroup[Any]]  #: group of CalibratedParameters
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
-        declare_read_limits(self)
-        self.settings = self.parameters.declare(self)
-        self.angle_options = ANGLES.declare(self)
-        self.autostart = self.settings.autostart
-        self.names: tuple[str, ...] = self.settings.fluoroscopes
+    def __init__(self, name: str, settings: type[Any]) -> None:
+        super().__init__(name, settings)
         self.reset()
 
     def make_angles(self) -> dict[str, AngleInput]:
         """Return the AngleInput of each fluoroscope; threads must not share one."""
-        angles = AngleInput(self.angle_options, self.names, self.limited_logger)
+        angles = AngleInput(self.settings.angles, self.names, self.limited_logger)
         return dict.fromkeys(self.names, angles)
 
     def angle_of(self, name: str, stamp_ns: int, field: AngleField | None) -> float | None:
@@ -158,8 +150,8 @@ class CorrectingNode(StreamNode):
             self, self.names, self.prepare, self.on_calibration_ready, self._on_refused_calibration
         )
         self.own(self._calibrations, self._calibrations.close)
-        if self.settings.calibration_directory:
-            self._load_calibrations(self.settings.calibration_directory)
+        if self.settings.node.calibration_directory:
+            self._load_calibrations(self.settings.node.calibration_directory)
 
     def _load_calibrations(self, text: str) -> None:
         """Start with the calibrations of a folder, which may be empty or missing at first."""

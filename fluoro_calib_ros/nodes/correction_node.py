@@ -12,33 +12,39 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
+from fluoro_calib_msgs.msg import CorrectedObservations
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo
 
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..exposures.angles import AngleOptions
 from ..exposures.stamps import nanoseconds_from_stamp
 from ..limits import StreamLimits
-from .correcting_node import ANGLES, CorrectedStream, CorrectingNode
-from .frame_validation import OBSERVED_REFUSALS, FrameValidator, with_limit
+from .correcting_node import CorrectedStream, CorrectingNode
+from .frame_validation import OBSERVED_REFUSALS, FrameValidator, subscribe_frames
 from .messages.fluoroscope_calibration import message_of_corrected_stream
-from .messages.observations import (
-    ObservedFrame,
-    decode_target_observations,
-    encode_corrected_observations,
-)
+from .messages.observations import ObservedFrame, encode_corrected_observations
 from .runtime.diagnostics import Refused
 from .runtime.lifecycle import stream_faults
 from .runtime.main import run
-from .runtime.parameters import READ_LIMITS, CalibratedParameters, ParameterGroup
+from .runtime.parameters import CalibratedParameters, group, parameters_of_managed
 from .runtime.topics import latched_qos, observations_qos
 
 # As int, because comparing an array with an enum member takes longer than all other work here.
 INVALID = int(CorrectionStatus.INVALID)
-_NODE = ParameterGroup(CalibratedParameters)
-_LIMITS = ParameterGroup(StreamLimits)
-PARAMETERS = (_NODE, ANGLES, _LIMITS, READ_LIMITS)
+
+
+@dataclass(frozen=True)
+class CorrectionSettings:
+    """Parameter values by group."""
+
+    node: CalibratedParameters = group(CalibratedParameters)
+    angles: AngleOptions = group(AngleOptions)
+    limits: StreamLimits = group(StreamLimits)
+
+
+PARAMETERS = parameters_of_managed(CorrectionSettings)
 
 
 @dataclass
@@ -61,11 +67,9 @@ class CorrectionNode(CorrectingNode):
     beyond = 'the points are OUTSIDE'
     stream_kind = ObservationStream
     topics = ('target_observations',)
-    parameters = _NODE
 
     def __init__(self) -> None:
-        super().__init__('correction_node')
-        self._limits = _LIMITS.declare(self)
+        super().__init__('correction_node', CorrectionSettings)
 
     def create_outputs(self) -> None:
         """Create the outputs and subscribe to calibrations."""
@@ -82,15 +86,7 @@ class CorrectionNode(CorrectingNode):
         """Receive the observations of all fluoroscopes in one thread."""
         angles = self.angles[self.names[0]]  # the same for all fluoroscopes
         reader = angles.create_reader(self, stream_faults(self.streams, self.fail))
-        for name in self.names:
-            reader.subscribe(
-                TargetObservations,
-                f'{name}/target_observations',
-                partial(self._on_frame, name),
-                observations_qos(),
-                decode=with_limit(decode_target_observations, self._limits.max_points),
-                max_bytes=self._limits.max_bytes,
-            )
+        subscribe_frames(reader, self, self.topics[0], self._on_frame)
 
     def prepare(self, calibration: FluoroscopeCalibration) -> FluoroscopeCalibration:
         """Prepare the lookup grid of a calibration, and return the calibration."""

@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage
 
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..exposures.collector import ExposureCollector, RadiographCollector, readiness
@@ -26,7 +27,6 @@ from ..images.codec import JPEG_START
 from ..limits import MEGABYTE
 from .calibration_output import CalibrationOutput
 from .calibration_settings import (
-    NOT_ACTIVE,
     CalibrationFiles,
     CalibrationSettings,
     RigSetup,
@@ -66,6 +66,7 @@ class PairWait:
 
 
 RADIOGRAPH = 'radiograph'
+NOT_ACTIVE = 'the node is not active, so no frames come in'
 
 
 class ExposureInput:
@@ -333,6 +334,19 @@ class RigServices(Worker):
         self._output, self._files, self._requests = parts.output, parts.files, parts.requests
         self._logger = parts.node.get_logger()
 
+    def _check_active(self) -> None:
+        """Raise DataError if no frames come in."""
+        if not self._node.readers:
+            raise DataError(NOT_ACTIVE)
+
+    def _all_calibrations(self) -> dict[str, FluoroscopeCalibration]:
+        """Return the calibrations in use. Raises DataError if a fluoroscope has none."""
+        calibrations = self._output.calibrations
+        missing = [name for name in self._rig.names if name not in calibrations]
+        if missing:
+            raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
+        return calibrations
+
 
 class CollectServices(RigServices):
     """The services capture, reset and collect_anew."""
@@ -377,8 +391,7 @@ class CollectServices(RigServices):
         """Raise ValueError (including DataError) if nothing can be captured."""
         self._rig.required_phantom()
         check_timeout(timeout_s)
-        if not self._node.readers:
-            raise DataError(NOT_ACTIVE)
+        self._check_active()
         waiting = self._requests.waiting
         if waiting >= self._rig.settings().limits.max_waiting:
             raise DataError(

@@ -58,13 +58,10 @@ from .runtime.diagnostics import Logger, RefusalLog, StartError, Status
 from .runtime.lifecycle import StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import (
-    READ_LIMITS,
     ManagedParameters,
-    declare_groups,
-    declare_read_limits,
     expand_path,
     group,
-    groups_of,
+    parameters_of_managed,
 )
 from .runtime.streams import remember
 from .runtime.topics import images_qos, observations_qos
@@ -146,7 +143,7 @@ class ExtractionSettings:
     angles: AngleOptions = group(AngleOptions)
 
 
-PARAMETERS = (*groups_of(ExtractionSettings).values(), READ_LIMITS)
+PARAMETERS = parameters_of_managed(ExtractionSettings)
 
 
 def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[FollowerSettings]:
@@ -219,11 +216,8 @@ class ExtractionNode(StreamNode):
     """Publishes the targets found in images."""
 
     def __init__(self) -> None:
-        super().__init__('extraction_node')
-        declare_read_limits(self)
-        self._settings = settings = declare_groups(self, ExtractionSettings)
-        self.autostart = settings.node.autostart
-        self.names = settings.node.fluoroscopes
+        super().__init__('extraction_node', ExtractionSettings)
+        settings = self.settings
         self._inputs = INPUTS[settings.node.inputs]
         AngleInput(settings.angles, self.names, self.limited_logger)  # refuses unknown joints
         self._followers = read_followers(settings, self.get_logger())
@@ -248,12 +242,12 @@ class ExtractionNode(StreamNode):
             )
             for name in self.names
         }
-        self._numbers = ExposureNumbers(self.names, self._settings.pairing.tolerance_ns)
+        self._numbers = ExposureNumbers(self.names, self.settings.pairing.tolerance_ns)
         self._angles = AngleInput(self._angle_options, self.names, self.limited_logger)
         self._workers = self._make_workers()
 
     def _make_workers(self) -> ExtractionWorkers:
-        size = self._settings.node.queue_size
+        size = self.settings.node.queue_size
         # Leave room for images that wait for the other views.
         size = max(size, LATE + 1) if self._calibrations else size
         return ExtractionWorkers(
@@ -316,7 +310,7 @@ class ExtractionNode(StreamNode):
         header = task.message.header
         if not observed.reason:
             radiographs = self._radiographs[stream.name]
-            if self._settings.node.mode == 'phantom' and radiographs.get_subscription_count():
+            if self.settings.node.mode == 'phantom' and radiographs.get_subscription_count():
                 jpeg = array('B', small_jpeg(image, RADIOGRAPH_PX))
                 radiographs.publish(CompressedImage(header=header, format='jpeg', data=jpeg))
             frame = Frame(

@@ -6,16 +6,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
+from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from numpy.typing import NDArray
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.frame import image_size_error, length_error, repeated_target_error, sigma_error
-from .messages.observations import CorrectedFrame, ObservedFrame
+from .messages.observations import (
+    CorrectedFrame,
+    ObservedFrame,
+    decode_corrected_observations,
+    decode_target_observations,
+)
 from .runtime.diagnostics import TOO_LARGE, Refused
-from .runtime.streams import TooLarge
+from .runtime.lifecycle import StreamNode
+from .runtime.streams import StreamReader, TooLarge
+from .runtime.topics import observations_qos
 
 # Kinds of refusals.
 OBSERVED_REFUSALS = (
@@ -47,6 +56,33 @@ def with_limit(decode: Callable[[bytes], Decoded], most: int) -> Callable[[bytes
         return frame
 
     return decode_limited
+
+
+# Message type of the frames on a topic, and the decoder of its bytes.
+FRAMES: dict[str, tuple[type, Callable[[bytes], Any]]] = {
+    'target_observations': (TargetObservations, decode_target_observations),
+    'corrected_observations': (CorrectedObservations, decode_corrected_observations),
+}
+
+
+def subscribe_frames(
+    reader: StreamReader, node: StreamNode, topic: str, on_frame: Callable[..., None]
+) -> None:
+    """Receive the frames of all fluoroscopes of a node on <fluoroscope>/<topic>, a key of FRAMES.
+
+    on_frame: called with fluoroscope, frame and times; see StreamReader.subscribe.
+    """
+    kind, decode = FRAMES[topic]
+    limits = node.settings.limits
+    for name in node.names:
+        reader.subscribe(
+            kind,
+            f'{name}/{topic}',
+            partial(on_frame, name),
+            observations_qos(),
+            decode=with_limit(decode, limits.max_points),
+            max_bytes=limits.max_bytes,
+        )
 
 
 class FrameValidator:

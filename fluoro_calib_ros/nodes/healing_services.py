@@ -33,7 +33,7 @@ from ..jobs.result_folder import save_calibrations, save_healed_version
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import in_worker_process
 from .calibration_services import Job
-from .calibration_settings import MAX_HEAL_S, NOT_ACTIVE, check_folders
+from .calibration_settings import MAX_HEAL_S, check_folders
 from .exposure_input import NodeParts
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.self_calibration import fill_healing
@@ -215,12 +215,8 @@ class Healing(Job):
 
     def _present_rig(self) -> _Rig:
         """Return the rig to be healed. Raises DataError if something is missing."""
-        if not self._node.readers:
-            raise DataError(NOT_ACTIVE)
-        calibrations = self._output.calibrations
-        missing = [name for name in self._rig.names if name not in calibrations]
-        if missing:
-            raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
+        self._check_active()
+        calibrations = self._all_calibrations()
         if self._output.orientation is None:
             raise DataError('the rig is not oriented yet')
         learned = learned_for(self._rig.directory, self._output.orientation)

@@ -18,12 +18,13 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..exposures.angles import AngleOptions
 from ..exposures.stamps import nanoseconds_from_stamp
 from ..images.angle_maps import AngleMaps
 from ..images.corrector import INTERPOLATIONS
 from ..options import option
 from .angle_input import AngleInput
-from .correcting_node import ANGLES, CorrectedStream, CorrectingNode
+from .correcting_node import CorrectedStream, CorrectingNode
 from .messages.fluoroscope_calibration import message_of_corrected_stream
 from .messages.image import (
     COMPRESSIONS,
@@ -35,7 +36,7 @@ from .messages.image import (
 from .runtime.diagnostics import Refused
 from .runtime.lifecycle import stream_faults
 from .runtime.main import run
-from .runtime.parameters import READ_LIMITS, CalibratedParameters, ParameterGroup
+from .runtime.parameters import CalibratedParameters, group, parameters_of_managed
 from .runtime.topics import images_qos, latched_qos
 
 RAW = (Image, 'image_raw')
@@ -66,8 +67,15 @@ class ImageParameters(CalibratedParameters):
     jpeg_quality: int = option(95, 'quality of jpeg images', minimum=1, maximum=100)
 
 
-_NODE = ParameterGroup(ImageParameters, settable=('compressed_format', 'jpeg_quality'))
-PARAMETERS = (_NODE, ANGLES, READ_LIMITS)
+@dataclass(frozen=True)
+class ImageSettings:
+    """Parameter values by group."""
+
+    node: ImageParameters = group(ImageParameters, settable=('compressed_format', 'jpeg_quality'))
+    angles: AngleOptions = group(AngleOptions)
+
+
+PARAMETERS = parameters_of_managed(ImageSettings)
 
 
 class _PreparedCalibration:
@@ -99,19 +107,17 @@ class ImageNode(CorrectingNode):
     refusal_kinds = IMAGE_REFUSALS
     beyond = 'the correction of the images is extrapolated'
     stream_kind = CorrectedImages
-    parameters = _NODE
 
     def __init__(self) -> None:
-        super().__init__('image_node')
-        self._inputs = INPUTS[self.settings.inputs]
+        super().__init__('image_node', ImageSettings)
+        self._inputs = INPUTS[self.settings.node.inputs]
         self.topics = tuple(topic for _, topic in self._inputs)
-        _NODE.follow(self, partial(setattr, self, 'settings'))
         use_single_thread()
 
     def make_angles(self) -> dict[str, AngleInput]:
         """Return an AngleInput for each fluoroscope, as each has its own thread."""
         return {
-            name: AngleInput(self.angle_options, self.names, self.limited_logger)
+            name: AngleInput(self.settings.angles, self.names, self.limited_logger)
             for name in self.names
         }
 
@@ -141,7 +147,7 @@ class ImageNode(CorrectingNode):
 
     def prepare(self, calibration: FluoroscopeCalibration) -> _PreparedCalibration:
         """Return the calibration with its pixel maps."""
-        return _PreparedCalibration(calibration, self.settings.interpolation)
+        return _PreparedCalibration(calibration, self.settings.node.interpolation)
 
     def on_calibration_ready(self, name: str, prepared: _PreparedCalibration) -> None:
         """Log that a calibration is in use."""
@@ -190,8 +196,8 @@ class ImageNode(CorrectingNode):
                 compressed_message(
                     corrected,
                     pixels,
-                    self.settings.compressed_format,
-                    self.settings.jpeg_quality,
+                    self.settings.node.compressed_format,
+                    self.settings.node.jpeg_quality,
                 )
             )
             stream.compressed += 1

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from fluoro_calib_msgs.action import Heal
-from fluoro_calib_msgs.msg import CorrectedObservations, DriftStatus, RigOrientation
+from fluoro_calib_msgs.msg import DriftStatus, RigOrientation
 from fluoro_calib_msgs.srv import Reset
 from rclpy.action import ActionClient
 from sensor_msgs.msg import CameraInfo
@@ -26,9 +26,9 @@ from ..options import option
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
 from ..reconstruction.timing import RecentExposures
 from .drift_monitor import DriftMonitor, DriftParameters
-from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
+from .frame_validation import CORRECTED_REFUSALS, subscribe_frames, validate_corrected
 from .messages.fluoroscope_calibration import image_size_of
-from .messages.observations import CorrectedFrame, decode_corrected_observations
+from .messages.observations import CorrectedFrame
 from .messages.points import PointsContent
 from .messages.rig_orientation import message_from_orientation, transforms_of_orientation
 from .reconstruction_output import (
@@ -46,16 +46,12 @@ from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status
 from .runtime.lifecycle import Stream, StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import (
-    READ_LIMITS,
     CalibratedParameters,
     check_frame,
-    declare_groups,
-    declare_read_limits,
-    follow_groups,
     group,
-    groups_of,
+    parameters_of_managed,
 )
-from .runtime.topics import latched_qos, observations_qos
+from .runtime.topics import latched_qos
 
 VIEWS = 'corrected_observations'
 
@@ -124,7 +120,7 @@ class ReconstructionSettings:
     limits: StreamLimits = group(StreamLimits)
 
 
-PARAMETERS = (*groups_of(ReconstructionSettings).values(), READ_LIMITS)
+PARAMETERS = parameters_of_managed(ReconstructionSettings)
 
 
 @dataclass(frozen=True)
@@ -145,30 +141,26 @@ class ReconstructionNode(StreamNode):
     """Publishes points in space for every exposure with at least two views."""
 
     def __init__(self) -> None:
-        super().__init__('reconstruction_node')
-        declare_read_limits(self)
-        self._settings = settings = declare_groups(self, ReconstructionSettings)
-        self.autostart = settings.node.autostart
-        self._names = settings.node.fluoroscopes
+        super().__init__('reconstruction_node', ReconstructionSettings)
+        settings = self.settings
         self._drift = DriftMonitor(
-            self._names, settings.drift, settings.drift_limits, self.get_logger()
+            self.names, settings.drift, settings.drift_limits, self.get_logger()
         )
         self.reset()
-        follow_groups(self, lambda: self._settings, self._use)
 
     def reset(self) -> None:
         """Discard the orientations and reset all counters."""
         self._drift.reset()
         self._refusals = RefusalLog('frame', self.limited_logger)
-        self._streams = {name: Stream(name, self._refusals) for name in self._names}
+        self._streams = {name: Stream(name, self._refusals) for name in self.names}
         self._rigs = RigInput(
-            self._names,
-            self._settings.node.reject,
+            self.names,
+            self.settings.node.reject,
             self._drift,
             refusals=self._refusals,
             logger=self.get_logger(),
         )
-        self._pairer = exposure_pairer(self._names, self._settings.pairing)
+        self._pairer = exposure_pairer(self.names, self.settings.pairing)
         self._points = PointsCounter()
         self._recent = RecentExposures(_View.corrected)
         self._follower: BodyFollower | None = None
@@ -177,11 +169,9 @@ class ReconstructionNode(StreamNode):
         self._without_orientation = 0
         self._latencies = LatencyWindow()
 
-    # -- parameters
-
-    def _use(self, settings: ReconstructionSettings) -> None:
-        """Use new settings from now on."""
-        self._settings = settings
+    def use(self, settings: ReconstructionSettings) -> None:
+        """Apply new settings from now on."""
+        super().use(settings)
         self._rigs.use_reject(settings.node.reject)
         self._pairer.use(settings.pairing)
         if self._drift.use(settings.drift, settings.drift_limits):
@@ -192,7 +182,7 @@ class ReconstructionNode(StreamNode):
     def create_outputs(self) -> None:
         """Create the outputs and subscribe to orientations."""
         self._output = PointsOutput(self)
-        self._retractions = PointRetractions(self, self._names, self._refusals)
+        self._retractions = PointRetractions(self, self.names, self._refusals)
         self._create_bodies()
         drift = self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)
         self.own(drift, self.destroy_publisher, drift)
@@ -208,7 +198,7 @@ class ReconstructionNode(StreamNode):
             ('rig_orientation_as_calibrated', self._on_calibrated),
         ):
             self.create_input(RigOrientation, topic, callback, latched_qos(), self._refusals)
-        for name in self._names:
+        for name in self.names:
             self.create_input(
                 CameraInfo,
                 f'{name}/camera_info',
@@ -216,14 +206,14 @@ class ReconstructionNode(StreamNode):
                 latched_qos(),
                 self._refusals,
             )
-        settings = self._settings.node
+        settings = self.settings.node
         saved = self._rigs.saved(settings.orientation_file, settings.calibration_directory)
         if saved is not None:
             self._on_orientation(saved)
 
     def _create_bodies(self) -> None:
         """Read the files of bodies and joints, and create their outputs. Raises DataError."""
-        settings = self._settings
+        settings = self.settings
         bodies, joints = read_body_files(settings.bodies, settings.node.rig_frame)
         if bodies:
             self._follower = BodyFollower(bodies, joints, settings.bodies.body_lag)
@@ -235,16 +225,7 @@ class ReconstructionNode(StreamNode):
     def create_readers(self) -> None:
         """Receive the corrected observations of all fluoroscopes in one thread."""
         reader = self.create_reader(stream_faults(self._streams, self.fail))
-        limits = self._settings.limits
-        for name in self._names:
-            reader.subscribe(
-                CorrectedObservations,
-                f'{name}/{VIEWS}',
-                partial(self._on_view, name),
-                observations_qos(),
-                decode=with_limit(decode_corrected_observations, limits.max_points),
-                max_bytes=limits.max_bytes,
-            )
+        subscribe_frames(reader, self, VIEWS, self._on_view)
 
     def deactivate(self) -> None:
         """Stop the stream readers, and publish the exposures that wait for later frames."""
@@ -273,9 +254,7 @@ class ReconstructionNode(StreamNode):
 
     def _publish_transforms(self, message: RigOrientation) -> None:
         self._transforms.publish(
-            transforms_of_orientation(
-                message, self._settings.node.rig_frame, self._rigs.calibrated
-            )
+            transforms_of_orientation(message, self.settings.node.rig_frame, self._rigs.calibrated)
         )
 
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
@@ -310,8 +289,8 @@ class ReconstructionNode(StreamNode):
         if rig is None:
             self._without_orientation += 1
             return False
-        views = [exposure[name].corrected() if name in exposure else None for name in self._names]
-        first_view = next(exposure[name] for name in self._names if name in exposure)
+        views = [exposure[name].corrected() if name in exposure else None for name in self.names]
+        first_view = next(exposure[name] for name in self.names if name in exposure)
         self._drift.newest = rig.watch, rig.orientation, first_view.stamp_ns
         intersector, image_sd = rig.widened()
         intersected = intersect_exposure(views, intersector, rig.scatter, image_sd)
@@ -323,7 +302,7 @@ class ReconstructionNode(StreamNode):
             target_id=intersected.target_id,
             points=intersected.points,
         )
-        settings = self._settings.node
+        settings = self.settings.node
         self._output.publish(content, settings.ellipsoid_sigmas, settings.ellipsoid_rate)
         self._retractions.note({n: view.stamp_ns for n, view in exposure.items()}, content)
         self._reconstructed += 1
@@ -348,7 +327,7 @@ class ReconstructionNode(StreamNode):
             misses, timing = self._recent.faults(rig.orientation, rig.is_doubtful)
         state = ReconstructionState(
             node=self,
-            topics=tuple(f'{name}/{VIEWS}' for name in self._names),
+            topics=tuple(f'{name}/{VIEWS}' for name in self.names),
             refusals=self._refusals,
             recent=self.recent.growth(
                 'reconstruction',

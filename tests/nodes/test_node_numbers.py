@@ -292,7 +292,7 @@ def test_parts_that_need_the_angle_of_a_frame_count_it_once():
     made, _ = angles()
     part = Fake(add=lambda name, frame, angle: angle())
     node = Fake(
-        _settings=Fake(angles=AngleOptions('a:carm')),
+        settings=Fake(angles=AngleOptions('a:carm')),
         _angles=made,
         _exposures=part,
         _healing=part,

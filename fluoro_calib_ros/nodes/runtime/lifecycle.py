@@ -32,7 +32,7 @@ from .diagnostics import (
     Trace,
     one_line,
 )
-from .parameters import ParameterNode
+from .parameters import ParameterNode, declare_groups, declare_read_limits, follow_groups
 from .streams import FaultHandlers, StreamReader
 from .topics import qos_overrides
 
@@ -43,14 +43,17 @@ class StreamNode(ParameterNode, LifecycleNode):
     """Lifecycle node with outputs and stream readers, which publishes diagnostics once a second.
 
     It configures and activates itself, unless autostart is false. Subclasses override
-    create_outputs(), create_readers(), diagnose() and reset(). deactivate() and cleanup() must
-    work in every state. A transition that raises is logged, which rclpy would not do, and undone;
-    after a failed deactivate() or cleanup(), everything is cleaned up.
+    create_outputs(), create_readers(), diagnose(), reset() and use(). deactivate() and cleanup()
+    must work in every state. A transition that raises is logged, which rclpy would not do, and
+    undone; after a failed deactivate() or cleanup(), everything is cleaned up.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, settings: type[Any]) -> None:
         super().__init__(name)
-        self.autostart = True
+        declare_read_limits(self)
+        #: values of the parameters by group, of which `node` has ManagedParameters
+        self.settings = declare_groups(self, settings)
+        self.names: tuple[str, ...] = self.settings.node.fluoroscopes
         self._starting = False
         self._fault = ''
         self.limited_logger = RateLimitedLogger(self.get_logger())
@@ -60,6 +63,11 @@ class StreamNode(ParameterNode, LifecycleNode):
         self.recent = RecentCounts()
         #: messages about publishers that cannot be received, by topic; checked once a second
         self.incompatible: dict[str, str] = {}
+        follow_groups(self, lambda: self.settings, self.use)
+
+    def use(self, settings: Any) -> None:
+        """Apply new settings from now on."""
+        self.settings = settings
 
     def create_outputs(self) -> None:
         """Create what exists while the node is configured, by create_output() and own()."""
@@ -187,7 +195,7 @@ class StreamNode(ParameterNode, LifecycleNode):
 
     def bring_up(self) -> None:
         """Configure and activate the node if autostart is set. Raises StartError."""
-        if not self.autostart:
+        if not self.settings.node.autostart:
             return
         self._starting = True
         for trigger in (self.trigger_configure, self.trigger_activate):

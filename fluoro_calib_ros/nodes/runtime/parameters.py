@@ -234,6 +234,11 @@ def groups_of(settings: type[Any]) -> dict[str, ParameterGroup[Any]]:
     return {setting.name: setting.metadata[_GROUP] for setting in fields(settings)}
 
 
+def parameters_of_managed(settings: type[Any]) -> tuple[ParameterGroup[Any], ...]:
+    """Return the parameter groups of a managed node with these settings."""
+    return (*groups_of(settings).values(), READ_LIMITS)
+
+
 def declare_groups(node: Node, settings: type[T]) -> T:
     """Declare the parameters of a settings dataclass; return their values. Raises StartError."""
     return settings(**{name: each.declare(node) for name, each in groups_of(settings).items()})

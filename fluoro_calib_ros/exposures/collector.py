@@ -176,13 +176,6 @@ class ExposureCollector:
             self.coverage.setdefault(name, Coverage(frame.image_size)).add(frame.uv)
         return ''
 
-    def reset(self) -> None:
-        """Discard all exposures."""
-        self.exposures, self.coverage, self._numbers = [], {}, set()
-        self._recent.clear()
-        self._streaming = False
-        self._single = None
-
     def frames(self, fluoroscopes: Iterable[str] | None = None) -> dict[str, list[Frame]]:
         """Return the collected frames by fluoroscope.
 

@@ -17,7 +17,6 @@ calibrate (calibration_services), heal (healing_services), and save and load
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cache, partial
 
 from fluoro_calib_msgs.msg import DriftStatus
@@ -46,6 +45,7 @@ from .exposure_input import (
 from .frame_validation import subscribe_frames
 from .healing_services import Healing
 from .messages.observations import ObservedFrame
+from .messages.status import fill_calibration
 from .runtime.conditions import health_of, state_of
 from .runtime.diagnostics import RefusalLog, Status
 from .runtime.lifecycle import StreamNode, stream_faults
@@ -173,22 +173,24 @@ class CalibrationNode(StreamNode):
 
     def _diagnose(self, stream: PhantomStream) -> Status:
         name = stream.name
-        progress = replace(
-            self._exposures.collected(name),
-            is_calibrating=name in self._calibrating.running,
-            last_round=self._calibrating.last_round.get(name),
-            calibration=self._output.calibrations.get(name),
-            calibration_age_s=self._output.age_s(name),
+        collected = self._exposures.collected(name)
+        calibration = self._output.calibrations.get(name)
+        fill_calibration(
+            collected.status,
+            calibration.calibration_id if calibration else '',
+            self._output.age_s(name),
+            running=name in self._calibrating.running,
+            last=self._calibrating.last_round.get(name),
         )
-        self._output.publish_status(progress)
+        self._output.publish_status(collected)
         state = state_of(
             FluoroscopeState,
             self,
             stream,
             [OBSERVATIONS],
             'target observations',
-            counts={'unpaired': progress.unpaired},
-            progress=progress,
+            counts={'unpaired': collected.status.frames_unpaired},
+            collected=collected,
             output=self._output,
             disagreement=self._exposures.disagreement(),
             angle=self._angles.health(name, self.incompatible),
@@ -196,11 +198,11 @@ class CalibrationNode(StreamNode):
         orientation = self._output.orientation
         verdict = self._output.verdict(name)
         values = {
-            **progress.values(),
+            **collected.values(),
             'calibration directory': self._rig.directory,
             'lost at the input': stream.overrun,
             'last fault': stream.refusals.last_fault,
-            'calibration': progress.calibration_id,
+            'calibration': collected.status.calibration_id,
             'verdict': verdict.verdict,
             'findings of the verdict': '\n'.join(verdict.findings),
             'orientation': orientation.orientation_id if orientation else '',

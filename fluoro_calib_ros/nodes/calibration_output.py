@@ -17,6 +17,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from ..correction import fluoroscope_calibration as calibration_result
+from ..errors import DataError
 from ..images.overlay import coverage_picture
 from ..io.calibration import Verdict
 from ..io.versions import calibrated_orientation
@@ -24,7 +25,7 @@ from ..photogrammetry import rig_orientation
 from .messages.fluoroscope_calibration import message_from_calibration
 from .messages.image import message_from_image
 from .messages.rig_orientation import message_from_orientation
-from .messages.status import Progress, message_from_progress
+from .messages.status import Collected
 from .runtime import conditions
 from .runtime.conditions import StreamState, fails, missing_publisher, warns
 from .runtime.diagnostics import OK, Health
@@ -70,6 +71,14 @@ class CalibrationOutput:
         """The calibrations in use, by fluoroscope."""
         return {name: self._in_use[name] for name in self._names if name in self._in_use}
 
+    def all_calibrations(self) -> dict[str, calibration_result.FluoroscopeCalibration]:
+        """Return the calibrations in use. Raises DataError if a fluoroscope has none."""
+        calibrations = self.calibrations
+        missing = [name for name in self._names if name not in calibrations]
+        if missing:
+            raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
+        return calibrations
+
     def publish(
         self,
         calibrations: Mapping[str, calibration_result.FluoroscopeCalibration],
@@ -110,28 +119,29 @@ class CalibrationOutput:
         """Return how long a calibration has been in use [s], NaN if there is none."""
         return time.monotonic() - self._since.get(name, float('nan'))
 
-    def publish_status(self, progress: Progress) -> None:
-        """Publish the progress of a fluoroscope, and a coverage picture if it has subscribers."""
+    def publish_status(self, collected: Collected) -> None:
+        """Publish the status of a fluoroscope, and a coverage picture if it has subscribers."""
+        status, readiness = collected.status, collected.readiness
+        name = status.fluoroscope
         stamp = self._node.get_clock().now().to_msg()
-        name = progress.fluoroscope
-        self._status[name].publish(message_from_progress(progress, stamp))
-        if progress.covered is None or not self._coverage[name].get_subscription_count():
+        status.header = Header(stamp=stamp, frame_id=f'{name}_optical')
+        self._status[name].publish(status)
+        if collected.covered is None or not self._coverage[name].get_subscription_count():
             return
         lines = (
-            f'{name}: {progress.exposures} exposures, {100 * progress.coverage:.0f} % covered',
-            progress.readiness.advice,
+            f'{name}: {status.exposures} exposures, {100 * status.coverage:.0f} % covered',
+            readiness.advice,
         )
-        size = progress.image_size or (1, 1)
-        picture = coverage_picture(progress.covered, size, lines, progress.readiness.areas)
-        header = Header(stamp=stamp, frame_id=f'{name}_optical')
-        self._coverage[name].publish(message_from_image(header, picture))
+        size = collected.image_size or (1, 1)
+        picture = coverage_picture(collected.covered, size, lines, readiness.areas)
+        self._coverage[name].publish(message_from_image(status.header, picture))
 
 
 @dataclass(frozen=True)
 class FluoroscopeState(StreamState):
     """State from which the health of a fluoroscope is diagnosed."""
 
-    progress: Progress
+    collected: Collected
     output: CalibrationOutput
     disagreement: str  #: message if stamps show that pairs may be wrong, else ''
     angle: Health | None  #: warning if the angle of the C-arm is unknown
@@ -140,7 +150,7 @@ class FluoroscopeState(StreamState):
 def _refused_calibration(state: FluoroscopeState) -> str:
     """Return why the last self-calibration gave no calibration, '' if it gave one."""
     reason = state.output.refused.get(state.stream.name, '')
-    in_use = state.progress.calibration_id or 'no calibration'
+    in_use = state.collected.status.calibration_id or 'no calibration'
     return reason and f'the last calibration was refused: {reason}; {in_use} is in use'
 
 
@@ -154,11 +164,10 @@ def _failed_verdict(state: FluoroscopeState) -> str:
 
 def working(state: FluoroscopeState) -> Health:
     """Report what the node is doing if nothing is wrong."""
-    progress = state.progress
-    if progress.is_calibrating:
-        last = progress.last_round
-        return Health(OK, f'self-calibration running, round {last.iteration if last else 0}')
-    return Health(OK, 'collecting exposures' if progress.calibration is None else 'calibrated')
+    status = state.collected.status
+    if status.state == status.CALIBRATING:
+        return Health(OK, f'self-calibration running, round {status.iteration}')
+    return Health(OK, 'calibrated' if status.calibration_id else 'collecting exposures')
 
 
 CONDITIONS = (

@@ -86,8 +86,8 @@ class OrientationService(RigServices):
         most = self._rig.settings().limits.max_exposures
         if request.frames > most:
             raise DataError(f'frames must be at most {most} (max_exposures), not {request.frames}')
-        self._check_active()
-        self._all_calibrations()
+        self._node.check_active()
+        self._output.all_calibrations()
         frames = await self._captured(names, request.frames or 1, timeout)
         calibrations = self._output.calibrations
         present_orientation = self._output.orientation

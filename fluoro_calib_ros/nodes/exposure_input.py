@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Capture, Reset
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..exposures.collector import ExposureCollector, RadiographCollector, readiness
@@ -32,7 +32,7 @@ from .calibration_settings import (
     RigSetup,
 )
 from .messages.observations import ObservedFrame, frame_from_observed
-from .messages.status import Progress
+from .messages.status import Collected
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
 from .runtime.lifecycle import Stream, StreamNode
 from .runtime.services import (
@@ -66,7 +66,6 @@ class PairWait:
 
 
 RADIOGRAPH = 'radiograph'
-NOT_ACTIVE = 'the node is not active, so no frames come in'
 
 
 class ExposureInput:
@@ -148,24 +147,24 @@ class ExposureInput:
         with self._lock:
             return self._radiographs.of(frames)
 
-    def collected(self, name: str) -> Progress:
+    def collected(self, name: str) -> Collected:
         """Return a summary of the data collected for a fluoroscope."""
         stream = self.streams[name]
         with self._lock:
             exposures = self._collector.exposures
             coverage = self._collector.coverage.get(name)
-            return Progress(
+            status = CalibrationStatus(
                 fluoroscope=name,
-                received=stream.received,
-                rejected=stream.refusals.total + stream.refusals.failures,
-                unpaired=self._pairer.unpaired[name],
+                frames_received=stream.received,
+                frames_rejected=stream.refusals.total + stream.refusals.failures,
+                frames_unpaired=self._pairer.unpaired[name],
                 exposures=len(exposures),
                 observations=sum(len(pair[name].target_id) for pair in exposures),
                 coverage=coverage.fraction if coverage else 0.0,
-                covered=coverage.covered if coverage else None,
-                image_size=stream.image_size,
-                readiness=readiness(len(exposures), coverage),
             )
+            covered = coverage.covered if coverage else None
+            ready = readiness(len(exposures), coverage)
+            return Collected(status, covered, stream.image_size, ready)
 
     def disagreement(self) -> str:
         """Return a message if stamps show that pairs may be wrong, else ''.
@@ -334,19 +333,6 @@ class RigServices(Worker):
         self._output, self._files, self._requests = parts.output, parts.files, parts.requests
         self._logger = parts.node.get_logger()
 
-    def _check_active(self) -> None:
-        """Raise DataError if no frames come in."""
-        if not self._node.readers:
-            raise DataError(NOT_ACTIVE)
-
-    def _all_calibrations(self) -> dict[str, FluoroscopeCalibration]:
-        """Return the calibrations in use. Raises DataError if a fluoroscope has none."""
-        calibrations = self._output.calibrations
-        missing = [name for name in self._rig.names if name not in calibrations]
-        if missing:
-            raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
-        return calibrations
-
 
 class CollectServices(RigServices):
     """The services capture, reset and collect_anew."""
@@ -378,7 +364,7 @@ class CollectServices(RigServices):
             first = wait.pairs[0][names[0]]
             response.message = f'frame {first.number} captured, {response.exposures} exposures now'
         else:
-            response.exposures = self._exposures.collected(names[0]).exposures
+            response.exposures = self._exposures.collected(names[0]).status.exposures
             streams = self._exposures.streams.values()
             received = ', '.join(f'{stream.name} {stream.received}' for stream in streams)
             response.message = self._exposures.capture_refusal or (
@@ -391,7 +377,7 @@ class CollectServices(RigServices):
         """Raise ValueError (including DataError) if nothing can be captured."""
         self._rig.required_phantom()
         check_timeout(timeout_s)
-        self._check_active()
+        self._node.check_active()
         waiting = self._requests.waiting
         if waiting >= self._rig.settings().limits.max_waiting:
             raise DataError(

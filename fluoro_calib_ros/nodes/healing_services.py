@@ -215,8 +215,8 @@ class Healing(Job):
 
     def _present_rig(self) -> _Rig:
         """Return the rig to be healed. Raises DataError if something is missing."""
-        self._check_active()
-        calibrations = self._all_calibrations()
+        self._node.check_active()
+        calibrations = self._output.all_calibrations()
         if self._output.orientation is None:
             raise DataError('the rig is not oriented yet')
         learned = learned_for(self._rig.directory, self._output.orientation)

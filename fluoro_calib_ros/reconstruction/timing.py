@@ -17,12 +17,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exposures.stamps import NS_PER_S
+from ..exposures.stamps import NS_PER_S, StampedFrame
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..rows import chosen_rows, joined_rows
@@ -55,19 +55,7 @@ MAX_EXCESS = 0.25
 KEPT = 0.796  # weighted variance of normal residuals over their variance, by these weights
 
 
-class TimedFrame(Protocol):
-    """Frame of a fluoroscope, such as a Frame."""
-
-    @property
-    def number(self) -> int:
-        """Number of the frame."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the frame [ns], 0 if unknown."""
-
-
-AnyFrame = TypeVar('AnyFrame', bound=TimedFrame)
+AnyFrame = TypeVar('AnyFrame', bound=StampedFrame)
 
 
 def timing_fault(
@@ -499,7 +487,7 @@ def delay_finding(names: tuple[str, str], delay: Delay, interval_s: float) -> Fi
     )
 
 
-def _interval_s(exposures: Sequence[Mapping[str, TimedFrame]], name: str) -> float:
+def _interval_s(exposures: Sequence[Mapping[str, StampedFrame]], name: str) -> float:
     """Return the median interval of the frames of a fluoroscope [s], 0 without stamps."""
     stamps = [exposure[name].stamp_ns for exposure in exposures if name in exposure]
     return float(np.median(np.diff(stamps))) / NS_PER_S if len(stamps) > 1 else 0.0

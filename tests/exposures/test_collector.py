@@ -232,8 +232,6 @@ def test_a_collected_pair_is_not_read_again_for_each_later_one():
     reads = first.reads
     assert not any(collector.add(pair(number)) for number in range(2, 30))
     assert first.reads == reads
-    collector.reset()
-    assert not collector.add(first)
 
 
 def test_pairs_without_a_stamp_are_collected_only_on_request():
@@ -242,19 +240,6 @@ def test_pairs_without_a_stamp_are_collected_only_on_request():
     assert collector.exposures == [] and len(reasons) == 1 and '' not in reasons
     assert collector.add(pair(5, -1000)) == '' and collector.offer(pair(6, 0, 50)) == ''
     assert [p['a'].number for p in collector.exposures] == [5, 6]
-
-
-def test_reset_discards_everything():
-    collector = ExposureCollector('ab')
-    collector.offer(pair(1, 0, 0))
-    collector.offer(pair(2, 10, 50))
-    collector.reset()
-    assert (
-        collector.exposures == []
-        and collector.coverage == {}
-        and collector.frames() == {'a': [], 'b': []}
-    )
-    assert collector.offer(pair(1, 20, 100)) == ''
 
 
 def test_frames_by_fluoroscope():

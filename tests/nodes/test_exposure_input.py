@@ -65,11 +65,11 @@ def test_counts_of_frames_are_kept_by_a_reset(exposures):
         for name in 'ab' if number == 2 else 'a':
             exposures.add(name, observed(name, number, number))
     exposures.add('a', observed('a', 1, 100))  # the stream restarts
-    before = exposures.collected('a')
-    assert (before.received, before.unpaired, before.exposures) == (4, 2, 1)
+    before = exposures.collected('a').status
+    assert (before.frames_received, before.frames_unpaired, before.exposures) == (4, 2, 1)
     assert exposures.reset() == 1
-    after = exposures.collected('a')
-    assert (after.received, after.unpaired, after.exposures) == (4, 2, 0)
+    after = exposures.collected('a').status
+    assert (after.frames_received, after.frames_unpaired, after.exposures) == (4, 2, 0)
 
 
 def test_frames_without_a_stamp_are_collected_only_by_a_capture_and_the_log_says_so(
@@ -78,14 +78,14 @@ def test_frames_without_a_stamp_are_collected_only_by_a_capture_and_the_log_says
     for number in range(1, 4):
         for name in 'ab':
             exposures.add(name, observed(name, number, 0))
-    assert exposures.collected('a').exposures == 0
+    assert exposures.collected('a').status.exposures == 0
     assert 'without a stamp' in exposures.streams['a'].refusals.last_fault
     assert 'use the service capture' in logger.lines[0]
     captured = exposures.next_pairs(collected=True)
     for name in 'ab':
         exposures.add(name, observed(name, 15, 0))
     assert captured.done.done() and captured.pairs[0]['a'].number == 15
-    assert exposures.collected('a').exposures == 1
+    assert exposures.collected('a').status.exposures == 1
 
 
 def test_a_wait_for_pairs_ends_with_its_last_pair_or_is_given_up(exposures):
@@ -104,7 +104,7 @@ def test_a_wait_for_pairs_ends_with_its_last_pair_or_is_given_up(exposures):
     for name in 'ab':
         exposures.add(name, observed(name, 3, 0))
     assert len(wait.pairs) == len(other.pairs) == 2
-    assert exposures.collected('a').exposures == 0
+    assert exposures.collected('a').status.exposures == 0
 
 
 def test_each_capture_has_the_number_of_exposures_with_its_own(exposures):

@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 
 from ...correction.fluoroscope_calibration import FluoroscopeCalibration
 from ...errors import DataError
+from ...exposures.frame import image_size_error
 from ...findings import Kind
 from ...images.codec import PIXEL_TYPES, decode, encode, raw_image
 from ..runtime.diagnostics import TOO_LARGE, Refused
@@ -49,13 +50,9 @@ class ImageConverter:
                 f'the frame id is {frame_id}, but the calibration is of {calibration.frame_id}',
             )
         image, encoding = self.decoded(message)
-        if image.shape[::-1] != tuple(calibration.image_size):
-            raise self.refusal(
-                'image size',
-                message,
-                f'the image is {image.shape[1]} x {image.shape[0]} px, but the '
-                f'calibration is for {calibration.image_size[0]} x {calibration.image_size[1]} px',
-            )
+        error = image_size_error((image.shape[1], image.shape[0]), calibration.image_size)
+        if error:
+            raise self.refusal('image size', message, error)
         return image, encoding
 
     def decoded(self, message: Image | CompressedImage) -> tuple[np.ndarray, str]:

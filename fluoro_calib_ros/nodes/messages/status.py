@@ -5,17 +5,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CalibrationStatus, DriftStatus
 from numpy.typing import NDArray
 
 from ...checks.drift_charts import DriftState
-from ...correction.fluoroscope_calibration import FluoroscopeCalibration
 from ...photogrammetry.rig_orientation import RigOrientation
 from .observations import stamp_from_nanoseconds
 
@@ -52,71 +49,47 @@ def message_from_drift_state(
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Data collected for one fluoroscope, and the progress of its calibration."""
+class Collected:
+    """Data collected for one fluoroscope."""
 
-    fluoroscope: str
-    #: numbers of frames
-    received: int
-    rejected: int
-    unpaired: int
-    #: numbers of collected exposures and of image points in them
-    exposures: int
-    observations: int
-    coverage: float  #: covered part of the image, 0 to 1
+    #: counts of frames, and of collected exposures and image points; see `fill_calibration`
+    status: CalibrationStatus
     #: whether cells (rows, columns) of the image are covered; None before the first exposure
     covered: NDArray[np.bool_] | None
     image_size: tuple[int, int] | None
     readiness: Readiness
-    is_calibrating: bool = False
-    last_round: Round | None = None  #: last round of the running or last self-calibration
-    calibration: FluoroscopeCalibration | None = None
-    calibration_age_s: float = math.nan
-
-    @property
-    def calibration_id(self) -> str:
-        """Id of the calibration, '' if there is none."""
-        return self.calibration.calibration_id if self.calibration else ''
 
     def values(self) -> dict[str, object]:
         """Return the values for the diagnostics."""
+        status = self.status
         return {
-            'exposures': self.exposures,
-            'coverage': f'{self.coverage:.2f}',
+            'exposures': status.exposures,
+            'coverage': f'{status.coverage:.2f}',
             'ready': self.readiness.ready,
             'next pose': self.readiness.advice,
-            'frames received': self.received,
-            'frames rejected': self.rejected,
-            'frames unpaired': self.unpaired,
+            'frames received': status.frames_received,
+            'frames rejected': status.frames_rejected,
+            'frames unpaired': status.frames_unpaired,
         }
 
 
-def message_from_progress(progress: Progress, stamp: Time) -> CalibrationStatus:
-    """Return the message of the progress of one fluoroscope."""
-    state = CalibrationStatus.COLLECTING
-    if progress.is_calibrating:
-        state = CalibrationStatus.CALIBRATING
-    elif progress.calibration is not None:
-        state = CalibrationStatus.CALIBRATED
-    message = CalibrationStatus(
-        fluoroscope=progress.fluoroscope,
-        state=state,
-        frames_received=progress.received,
-        frames_rejected=progress.rejected,
-        frames_unpaired=progress.unpaired,
-        exposures=progress.exposures,
-        observations=progress.observations,
-        coverage=progress.coverage,
-        calibration_age=progress.calibration_age_s,
-        calibration_id=progress.calibration_id,
-    )
-    message.header.stamp = stamp
-    message.header.frame_id = f'{progress.fluoroscope}_optical'
-    last = progress.last_round
+def fill_calibration(
+    status: CalibrationStatus, calibration_id: str, age_s: float, running: bool, last: Round | None
+) -> None:
+    """Fill in the progress of the calibration of a fluoroscope.
+
+    calibration_id, age_s: of the calibration in use, '' and NaN if there is none. running: whether
+    a self-calibration is running. last: last round of the running or last one, or None.
+    """
+    status.state = status.CALIBRATED if calibration_id else status.COLLECTING
+    if running:
+        status.state = status.CALIBRATING
+    status.calibration_id = calibration_id
+    status.calibration_age = age_s
     if last is not None:
-        message.iteration = last.iteration
-        message.k = last.k[progress.fluoroscope]
-        message.cost_adjustment = last.F
-        message.cost_regression = last.G
-        message.rmse_u, message.rmse_v = (float(x) for x in last.rmse[progress.fluoroscope])
-    return message
+        name = status.fluoroscope
+        status.iteration = last.iteration
+        status.k = last.k[name]
+        status.cost_adjustment = last.F
+        status.cost_regression = last.G
+        status.rmse_u, status.rmse_v = (float(x) for x in last.rmse[name])

@@ -17,6 +17,7 @@ from rclpy.lifecycle.node import LifecycleState
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
+from ...errors import DataError
 from .diagnostics import (
     TOO_LARGE,
     USER_ERRORS,
@@ -131,6 +132,11 @@ class StreamNode(ParameterNode, LifecycleNode):
     def has_publisher(self, topic: str) -> bool:
         """Return whether a topic, named as in this node, has a publisher; remaps are applied."""
         return bool(self.count_publishers(self.resolve_topic_name(topic)))
+
+    def check_active(self) -> None:
+        """Raise DataError if the node is not active."""
+        if not self.readers:
+            raise DataError('the node is not active, so no frames come in')
 
     def configure(self) -> None:
         """Create outputs, slow inputs and the diagnostics."""

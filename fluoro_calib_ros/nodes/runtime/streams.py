@@ -45,7 +45,6 @@ from .topics import (
     OBSERVATION_DEPTH,
     adaptation_message,
     differs,
-    incompatible_qos_message,
     qos_overrides,
     reliable_if_offered,
 )
@@ -252,7 +251,10 @@ class StreamReader:
                 )
                 if result == QoSCompatibility.ERROR:
                     reason = reason.removeprefix('ERROR: ').strip(' ;.').lower()
-                    messages[route.topic] = incompatible_qos_message(route.topic, reason)
+                    messages[route.topic] = (
+                        f'topic {route.topic}: a publisher offers an incompatible quality of '
+                        f'service ({reason}), its messages are not received'
+                    )
         return messages
 
     def _publishers(self, route: _Route) -> Sequence[TopicEndpointInfo]:

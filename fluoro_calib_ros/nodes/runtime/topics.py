@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
+from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -232,36 +233,31 @@ RECORDED_LATCHED_DEPTH = 100  # one message each of as many publishers
 REQUEST_DEPTH = 200
 
 
-def observations_qos() -> QoSProfile:
-    """Return the profile of image points and reconstructed points."""
-    return _reliable(OBSERVATION_DEPTH)
-
-
-def images_qos() -> QoSProfile:
-    """Return the profile of images."""
-    return _reliable(IMAGE_DEPTH)
-
-
-def latched_qos() -> QoSProfile:
-    """Return the profile of topics whose last message late subscribers also receive."""
-    return _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def recorded_latched_qos() -> QoSProfile:
-    """Return the profile for playing latched topics: one player replays many publishers."""
-    return _reliable(RECORDED_LATCHED_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def clock_qos() -> QoSProfile:
-    """Return the profile of /clock, as in rosbag2."""
+def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
     return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
     )
 
 
-def services_qos() -> QoSProfile:
-    """Return the profile of services: a burst of requests is queued, and all are answered."""
-    return _reliable(REQUEST_DEPTH)
+observations_qos = partial(_reliable, OBSERVATION_DEPTH)  # image points and reconstructed points
+images_qos = partial(_reliable, IMAGE_DEPTH)
+services_qos = partial(_reliable, REQUEST_DEPTH)  # a burst of requests is queued, and answered
+# Topics whose last message late subscribers also receive.
+latched_qos = partial(_reliable, 1, DurabilityPolicy.TRANSIENT_LOCAL)
+# The same for a player, which replays many publishers.
+recorded_latched_qos = partial(_reliable, RECORDED_LATCHED_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
+# Of /clock, as in rosbag2.
+clock_qos = partial(
+    QoSProfile,
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.BEST_EFFORT,
+)
+# Options by which users may override history, depth and reliability of a topic.
+qos_overrides = QoSOverridingOptions.with_default_policies
 
 
 def adapted_qos(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
@@ -316,26 +312,4 @@ def adaptation_message(topic: str, qos: QoSProfile) -> str:
         f'topic {topic}: the subscription is now {"best effort" if best_effort else "reliable"} '
         f'and {"latched" if latched else "volatile"}, as its publishers require'
         + ('; lost messages are not sent again' if best_effort else '')
-    )
-
-
-def qos_overrides() -> QoSOverridingOptions:
-    """Return options by which users may override history, depth and reliability of a topic."""
-    return QoSOverridingOptions.with_default_policies()
-
-
-def incompatible_qos_message(topic: str, policy: str) -> str:
-    """Return the message about a publisher that offers less than a subscription requests."""
-    return (
-        f'topic {topic}: a publisher offers an incompatible quality of service ({policy}), '
-        'its messages are not received'
-    )
-
-
-def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=durability,
     )

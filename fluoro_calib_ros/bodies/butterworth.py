@@ -102,8 +102,5 @@ def _propagated(
 def _nearest(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return values (T, ...), replaced by the nearest known exposure's where unknown."""
     rows = np.flatnonzero(known)
-    after = np.searchsorted(rows, np.arange(len(known))).clip(0, len(rows) - 1)
-    before = np.maximum(after - 1, 0)
-    time = np.arange(len(known))
-    before_is_nearer = np.abs(rows[before] - time) < np.abs(rows[after] - time)
-    return values[np.where(before_is_nearer, rows[before], rows[after])]
+    middle = (rows[1:] + rows[:-1]) / 2
+    return values[rows[np.searchsorted(middle, np.arange(len(known)), side='right')]]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 
 from ..exposures.angles import AngleOptions
 from ..limits import MEGABYTE
-from .messages.observations import JointStates, decode_joint_state
+from .messages.observations import decode_joint_state
 from .runtime.diagnostics import WARN, Health, RateLimitedLogger, StartError
 from .runtime.lifecycle import StreamNode
 from .runtime.streams import FaultHandlers, StreamReader
@@ -132,7 +132,7 @@ class AngleInput:
         reason = self._angles.doubt(name, lookup.stamp_ns) or 'some exposures had none'
         return f'the angle of the C-arm is unknown: {reason}'
 
-    def _on_state(self, state: JointStates, _: Mapping[str, int]) -> None:
+    def _on_state(self, state: tuple[Any, ...], _: Mapping[str, int]) -> None:
         self._angles.add(*state)
         self._received += 1
 

@@ -25,6 +25,7 @@ from ..simulation.marker_images import MarkerScene
 from ..simulation.rig import (
     CLUSTER_MARKERS,
     Detection,
+    StreamStart,
     detect_beads,
     phantom_poses,
     simulate_grid,
@@ -242,14 +243,7 @@ class SimulatorNode(WorkerNode):
                 self._rig.phantom.target_id,
                 self._detection,
             )
-            yield Frame(
-                fluoroscope.name,
-                number,
-                ids,
-                uv,
-                fluoroscope.image_size,
-                frame_id=f'{fluoroscope.name}_optical',
-            )
+            yield StreamStart(0, number).frame(fluoroscope, 0, 0.0, ids, uv)
 
     def _pose(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the current pose of the phantom: standing, or moving to the next pose."""

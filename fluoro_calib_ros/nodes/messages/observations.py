@@ -67,18 +67,20 @@ def read_string(data: bytes, start: int, length: int) -> tuple[str, int]:
     return data[start:end].partition(b'\0')[0].decode(errors='replace'), end + -end % 4
 
 
-def read_float64_sequence(data: bytes, start: int) -> tuple[NDArray[np.float64], int]:
-    """Read a sequence of float64; return it and the offset after it. Raises ValueError."""
-    (count,) = UINT32.unpack_from(data, start)
-    start += 4
-    if not count:
-        return np.zeros(0), start
-    start += (4 - start) % 8
-    end = start + 8 * count
-    if end > len(data):
-        raise ValueError(TRUNCATED)
-    # Copy, because the numbers are not aligned in the memory of the message.
-    return np.frombuffer(data[start:end]), end
+def read_columns(data: bytes, start: int, number: int) -> tuple[list[NDArray[np.float64]], int]:
+    """Read sequences of float64; return them and the offset after them. Raises ValueError."""
+    columns = []
+    for _ in range(number):
+        (count,) = UINT32.unpack_from(data, start)
+        start += 4
+        start += (4 - start) % 8 if count else 0
+        end = start + 8 * count
+        if end > len(data):
+            raise ValueError(TRUNCATED)
+        # Copy, because the numbers are not aligned in the memory of the message.
+        columns.append(np.frombuffer(data[start:end]))
+        start = end
+    return columns, start
 
 
 def string_bytes(text: str) -> bytes:
@@ -183,9 +185,7 @@ def decode_target_observations(data: bytes) -> ObservedFrame:
         sec, nanosec, frame_id, image_start = read_header(data)
         number, width, height, count = _IMAGE.unpack_from(data, image_start)
         end = image_start + 16 + 4 * count
-        u, offset = read_float64_sequence(data, end)
-        v, offset = read_float64_sequence(data, offset)
-        sigma, _ = read_float64_sequence(data, offset)
+        (u, v, sigma), _ = read_columns(data, end, 3)
     except error as reason:  # beyond the end of the bytes
         raise ValueError(str(reason)) from None
     return ObservedFrame(
@@ -287,10 +287,7 @@ def decode_corrected_observations(data: bytes) -> CorrectedFrame:
         offset += 4
         target_id = np.frombuffer(data[offset : offset + 4 * count], np.uint32)
         offset += 4 * count
-        u, offset = read_float64_sequence(data, offset)
-        v, offset = read_float64_sequence(data, offset)
-        sigma, offset = read_float64_sequence(data, offset)
-        correction_sd, offset = read_float64_sequence(data, offset)
+        (u, v, sigma, correction_sd), offset = read_columns(data, offset, 4)
         (count,) = UINT32.unpack_from(data, offset)
     except error as reason:  # beyond the end of the bytes
         raise ValueError(str(reason)) from None
@@ -328,17 +325,10 @@ def encode_corrected_observations(
 # JointState: positions of joints, including the angles of C-arms.
 
 
-class JointStates(NamedTuple):
-    """Stamp [ns], names and positions [rad] of joints; positions may be of any length."""
+def decode_joint_state(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
+    """Read a JointState message from its bytes: stamp [ns], names and positions [rad] of joints.
 
-    stamp_ns: int
-    names: Sequence[str]
-    positions: Sequence[float]
-
-
-def decode_joint_state(data: bytes) -> JointStates:
-    """Read a JointState message from its bytes. Raises one of DECODING_ERRORS."""
+    Positions may be of any length. Raises one of DECODING_ERRORS.
+    """
     message = deserialize_message(data, JointState)
-    return JointStates(
-        nanoseconds_from_stamp(message.header.stamp), message.name, message.position
-    )
+    return nanoseconds_from_stamp(message.header.stamp), message.name, message.position

@@ -325,17 +325,13 @@ class LatencyWindow:
     """Window of the last latencies; one thread writes it and another reads it."""
 
     def __init__(self) -> None:
-        self._ring = np.zeros(2000, dtype=np.int64)
-        self._count = 0
-
-    def add(self, nanoseconds: int) -> None:
-        """Add a latency [ns]."""
-        self._ring[self._count % len(self._ring)] = nanoseconds
-        self._count += 1
+        self._latest: deque[int] = deque(maxlen=2000)
+        self.add = self._latest.append  #: adds a latency [ns]
 
     def values(self) -> dict[str, str]:
         """Return median and 99th percentile for the diagnostics, nothing before the first one."""
-        if not self._count:
+        latest = list(self._latest)
+        if not latest:
             return {}
-        p50, p99 = np.percentile(self._ring[: self._count], [50, 99]) * 1e-6
+        p50, p99 = np.percentile(latest, [50, 99]) * 1e-6
         return {'latency p50 [ms]': f'{p50:.3f}', 'latency p99 [ms]': f'{p99:.3f}'}

@@ -40,9 +40,9 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.jobs.result_folder import save_calibrations
-from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.nodes.runtime.streams import StreamReader
 from fluoro_calib_ros.nodes.runtime.topics import observations_qos
 from fluoro_calib_ros.simulation.rig import (

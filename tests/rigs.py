@@ -15,7 +15,7 @@ from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.correction.angle_field import AngleField
 from fluoro_calib_ros.correction.calibration_record import HARMONICS, SD_GRID, TERMS, VARIANCES
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
-from fluoro_calib_ros.correction.registry import create_model, no_correction
+from fluoro_calib_ros.correction.registry import model_type, no_correction
 from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
@@ -32,6 +32,11 @@ from fluoro_calib_ros.simulation.rig import (
     simulate_exposures,
     virtual_rig,
 )
+
+
+def create_model(kind, *arguments, **more):
+    """Return a correction model of a kind."""
+    return model_type(kind)(*arguments, **more)
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.simulation.rig import StreamStart, simulate_tracking, virtual_rig
 
 from ..timing import section

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -283,11 +284,12 @@ def rigid_clusters(
 
 
 def options_of(kind: type[T], arguments: argparse.Namespace, **values: Any) -> T:
-    """Return an options dataclass from its arguments; values replace them.
+    """Return a dataclass of options, or of a request, from the arguments of the same names.
 
-    An option without an argument keeps its default. Raises ValueError.
+    values replace them; a field without an argument keeps its default. Raises ValueError.
     """
-    parsed = {n: getattr(arguments, n) for n in declared(kind) if hasattr(arguments, n)}
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    parsed = {n: getattr(arguments, n) for n in names if hasattr(arguments, n)}
     return kind(**{**parsed, **values})
 
 
@@ -459,8 +461,7 @@ def cluster_of(arguments: argparse.Namespace) -> Cluster | None:
 
     if arguments.scheduler is None:
         return None
-    files = (arguments.tls_ca, arguments.tls_cert, arguments.tls_key)
-    return Cluster(arguments.scheduler, *files, arguments.trusted_network)
+    return options_of(Cluster, arguments)
 
 
 def angle_of(arguments: argparse.Namespace) -> float | None:

@@ -21,6 +21,7 @@ from .arguments import (
     file_settings,
     input_paths,
     number_in,
+    options_of,
 )
 from .output import print_notes, print_result
 
@@ -34,8 +35,6 @@ def _with_meaning(kind: str) -> str:
     """Return the kind of a format with its title, for the help."""
     from ..io.formats.registry import FORMATS
 
-    if kind not in FORMATS:
-        return f'{kind} (MCAP bag as rosbag2 writes it)'
     title = FORMATS[kind].title.removesuffix(' of fluoro_calib_ros')
     return kind if title.lower() == kind else f'{kind} ({title})'
 
@@ -134,17 +133,12 @@ def run(arguments: argparse.Namespace) -> None:
     if not arguments.out.is_dir():  # bags and formats with several files create or fill a folder
         check_output_file(arguments.out, inputs)
     written = convert(
-        ConversionRequest(
-            source=arguments.source,
+        options_of(
+            ConversionRequest,
+            arguments,
             kind=arguments.to,
-            out=arguments.out,
-            source_kind=arguments.source_kind,
-            exposure=arguments.exposure,
-            calibration=arguments.calibration,
-            corrected=arguments.corrected,
             fluoroscopes=tuple(arguments.fluoroscopes or ()),
             settings=file_settings(arguments, rate_hz=arguments.rate),
-            out_units=arguments.out_units,
             angle=angle_of(arguments),
             angles=angle_options(arguments),
         )

@@ -19,6 +19,7 @@ from .arguments import (
     cluster_of,
     file_settings,
     input_paths,
+    options_of,
 )
 from .output import ProgressBar, print_note, print_notes, print_result
 
@@ -170,15 +171,11 @@ def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -
                 '--angles is given'
             )
         calibration = calibration.at_angle(angle_of(arguments))
-    request = ImageCorrectionRequest(
-        source=source,
-        out=arguments.out,
+    request = options_of(
+        ImageCorrectionRequest,
+        arguments,
         calibration=calibration,
-        interpolation=arguments.interpolation,
-        workers=arguments.workers,
         scheduler=cluster_of(arguments),
-        recursive=arguments.recursive,
-        keep_going=arguments.keep_going,
         angles=angles,
     )
     with ProgressBar(source.name) as progress:

@@ -199,15 +199,13 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
     print_notes(survey.notes)
     angles = ImageAngles(angle_options(arguments), angle_of(arguments))
     angles.check(arguments.sources, arguments.fluoroscope)
-    request = ExtractionRequest(
-        arguments.sources,
-        survey.phantom,
-        fluoroscope,
+    request = options_of(
+        ExtractionRequest,
+        arguments,
+        phantom=survey.phantom,
+        fluoroscope=fluoroscope,
         principal_distance_px=arguments.principal_distance,
-        overlay=arguments.overlay,
-        workers=arguments.workers,
         scheduler=cluster_of(arguments),
-        regular_grid=arguments.regular_grid,
         angles=angles,
     )
     with ProgressBar('extract') as bar:

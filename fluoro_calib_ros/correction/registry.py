@@ -198,31 +198,12 @@ def neighbour_models() -> tuple[str, ...]:
     return tuple(name for name, model in MODELS.items() if model.min_k is not None)
 
 
-def create_model(
-    kind: str,
-    k: int,
-    train_uv: NDArray[np.float64],
-    train_duv: NDArray[np.float64],
-    noise_px: float = 0.0,
-    bias_px: float = 0.0,
-    series: Series | None = None,
-) -> CorrectionModel:
-    """Create a model of a kind; see `CorrectionModel` for the arguments.
-
-    Raises ValueError for an unknown kind, and for arguments that the model does not accept.
-    """
-    return model_type(kind)(
-        k, train_uv, train_duv, noise_px=noise_px, bias_px=bias_px, series=series
-    )
-
-
 def model_from_values(values: Mapping[str, Any], image_size: tuple[int, int]) -> CorrectionModel:
     """Return the model from which `CorrectionModel.to_values` made the values.
 
     image_size: width and height [px], needed for the functions of a series. Raises ValueError.
     """
-    return create_model(
-        values['model_kind'],
+    return model_type(values['model_kind'])(
         values['model_k'],
         train_uv=values['train_uv'],
         train_duv=values['train_duv'],

@@ -19,7 +19,7 @@ from ..exposures.stamps import nanoseconds_from_stamp
 from ..io.access import make_folder, write_bytes
 from ..io.bags.metadata import message_class
 from ..io.bags.reader import IMAGE
-from ..io.bags.writer import BagWriter
+from ..io.bags.writer import BagWriter, write_bag
 from ..jobs.simulation import (
     BODIES,
     JOINTS,
@@ -27,7 +27,6 @@ from ..jobs.simulation import (
     TRUTH,
     RenderedScene,
     Renderers,
-    write_bag,
     write_knee,
 )
 from ..nodes.demo_client import DemoClient, DemoError

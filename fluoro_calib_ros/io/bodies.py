@@ -200,24 +200,14 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
         if not isinstance(value, str) or (not value and key != 'side'):
             raise DataError(f'{where}, key {key}: expected a text')
         texts[key] = value
-    try:
+    with ErrorsAt(where):
         joint_convention = convention(texts['convention'])
         joint_convention.check_side(texts['side'])
         frames = {
-            end: _frame(joint_convention, end, table.get(f'{end}_frame'), texts['side'])
+            f'{end}_frame': _frame(joint_convention, end, table.get(f'{end}_frame'), texts['side'])
             for end in ('proximal', 'distal')
         }
-        joint = Joint(
-            texts['name'],
-            texts['proximal'],
-            texts['distal'],
-            texts['convention'],
-            proximal_frame=frames['proximal'],
-            distal_frame=frames['distal'],
-            side=texts['side'],
-        )
-    except DataError as error:
-        raise DataError(f'{where}: {error}') from None
+        joint = Joint(**texts, **frames)
     return JointEntry(joint, _neutral(where, table.get('neutral')))
 
 
@@ -236,7 +226,7 @@ def _frame(of: Convention, end: str, table: Any, side: str) -> AnatomicalFrame:
     """Return the frame of one end of a joint. Raises DataError that names the end."""
     if table is None:
         return BODY_FRAME
-    try:
+    with ErrorsAt(f'{end}_frame'):
         if not isinstance(table, Mapping):
             raise DataError('this is not a table')
         for key in table:
@@ -248,8 +238,6 @@ def _frame(of: Convention, end: str, table: Any, side: str) -> AnatomicalFrame:
         if len(given_keys) != 1:
             raise DataError(f'one of {", ".join(FRAME_KEYS[:4])} is needed, not {len(given_keys)}')
         return _frame_of(of, end, table, side)
-    except DataError as error:
-        raise DataError(f'{end}_frame: {error}') from None
 
 
 def _frame_of(of: Convention, end: str, table: Mapping[str, Any], side: str) -> AnatomicalFrame:

@@ -63,6 +63,12 @@ class Block:
         self.require(name, np.isfinite(values), 'not a finite number')
         return values
 
+    def positive(self, name: str) -> NDArray[np.float64]:
+        """Return a column (n,) of finite numbers above 0. Raises DataError."""
+        values = self.floats(name)
+        self.require(name, values > 0, 'not above 0')
+        return values
+
     def floats_or_nan(self, name: str) -> NDArray[np.float64]:
         """Return a column (n,) of finite numbers, NaN for an empty cell. Raises DataError."""
         cells = [cell or 'nan' for cell in self.strings(name)]

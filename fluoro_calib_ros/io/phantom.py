@@ -45,10 +45,7 @@ def _read(path: PathLike, column: NamedColumn) -> Phantom:
     max_targets = read_limits().max_targets
     if len(ids) > max_targets:
         raise DataError(f'{path}: phantoms of more than {max_targets} targets are not read')
-    diameters = None
-    if DIAMETER in rows:
-        diameters = rows.floats(DIAMETER)
-        rows.require(DIAMETER, diameters > 0, 'not above 0')
+    diameters = rows.positive(DIAMETER) if DIAMETER in rows else None
     repeated = first_repeated(ids)
     if repeated is not None:
         first, second = repeated
@@ -59,9 +56,7 @@ def _read(path: PathLike, column: NamedColumn) -> Phantom:
 
 def _numbers(rows: Block) -> np.ndarray:
     """Return x, y, z and sd (n, 4) of the rows of a file. Raises DataError."""
-    numbers = np.column_stack([rows.floats(name) for name in COLUMNS[1:]])
-    rows.require('sd', numbers[:, 3] > 0, 'not above 0')
-    return numbers
+    return np.column_stack([*(rows.floats(name) for name in 'xyz'), rows.positive('sd')])
 
 
 def has_exposures(path: PathLike) -> bool:

@@ -149,16 +149,7 @@ def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
         'rmse_px': {'before': figures.rmse_before, 'after': figures.rmse_after},
         'inliers': figures.inliers,
         'observations': figures.observations,
-        'exposures': [
-            {
-                'exposure': e.exposure,
-                'position_mm': e.position_mm,
-                'quaternion_wxyz': e.quaternion_wxyz,
-                'sd_mm': e.sd_mm,
-                'sd_rad': e.sd_rad,
-            }
-            for e in figures.exposures
-        ],
+        'exposures': [vars(exposure) for exposure in figures.exposures],
     }
 
 

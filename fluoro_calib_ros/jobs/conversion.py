@@ -38,7 +38,6 @@ from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..io.formats import registry
 from ..io.formats.content import (
-    PARTS,
     Bodies,
     Camera,
     Content,
@@ -51,10 +50,8 @@ from ..io.phantom import read_phantom
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .result_folder import belongs_to
-from .simulation import write_bag
 from .sources import calibrated_settings, require_observed, select_calibrations
 
-BAG = 'bag'
 PHANTOM_BODY = 'phantom'  # name of the phantom as a rigid body
 
 
@@ -109,7 +106,7 @@ class ConversionRequest:
 
 def kinds_written() -> tuple[str, ...]:
     """Return the formats that can be written."""
-    return (BAG, *registry.kinds(lambda format_: format_.write))
+    return registry.kinds(lambda format_: format_.write)
 
 
 def kinds_read() -> tuple[str, ...]:
@@ -128,7 +125,7 @@ def convert(request: ConversionRequest) -> Written:
     if request.calibration is not None:
         calibrations = load_calibrations(request.calibration)
         settings = calibrated_settings(settings, request.calibration, calibrations)
-    wanted = _parts_written(request.kind)
+    wanted = registry.FORMATS[request.kind].parts
     read_settings = replace(settings, wanted=wanted, fluoroscopes=tuple(request.fluoroscopes))
     content, is_own = _read(request, read_settings)
     content = replace(content, names=settings.names.merged(content.names))
@@ -180,13 +177,10 @@ def _lost_angles(request: ConversionRequest, observations: Frames) -> tuple[str,
         frame.angle is not None for frames in observations.values() for frame in frames
     )
     holds_angles = request.kind == 'observations'
-    if holds_angles or not has_angle or 'observations' not in _parts_written(request.kind):
+    parts = registry.FORMATS[request.kind].parts
+    if holds_angles or not has_angle or 'observations' not in parts:
         return ()
     return (f'{request.out}: this format has no angles of the C-arm, they are not written',)
-
-
-def _parts_written(kind: str) -> tuple[str, ...]:
-    return ('observations',) if kind == BAG else registry.FORMATS[kind].parts
 
 
 def is_result_folder(path: Path) -> bool:
@@ -223,14 +217,6 @@ def _selected(content: Content, request: ConversionRequest) -> Content:
 
 def _write(request: ConversionRequest, content: Content, is_own: bool) -> Written:
     settings = request.settings
-    if request.kind == BAG:
-        if not content.observations:
-            parts_text = (
-                ' and '.join(PARTS[name] for name in content.parts) or 'nothing of that kind'
-            )
-            raise DataError(f'a bag needs image points, but the source has {parts_text}')
-        write_bag(request.out, content.observations)
-        return Written((str(request.out),))
     keeps_unit = not registry.FORMATS[request.kind].says_units
     units = request.out_units or (settings.units if keeps_unit else None)
     if not is_own:
@@ -244,12 +230,9 @@ def _corrected(
     """Return frames with the image points that could be corrected, and notes."""
     out: dict[str, list[Frame]] = {}
     notes: list[str] = []
-    for name, frames in (content.observations or {}).items():
-        if name not in calibrations:
-            raise DataError(
-                f'{request.source}: there is no calibration of fluoroscope {name!r}, only of '
-                f'{", ".join(calibrations)}'
-            )
+    observations = content.observations or {}
+    select_calibrations(calibrations, observations, request.source)
+    for name, frames in observations.items():
         out[name] = []
         angles = [frame.angle for frame in frames]
         note = note_on_angles(name, calibrations[name].angle_field, angles)

@@ -4,7 +4,8 @@
 """Tracking of phantoms and of moving markers from image to image, live and offline.
 
 Each image uses the results of earlier images. A recording is treated as a stream that ends: jobs
-pass its images to the same followers that the extraction node uses for those of a camera.
+pass its images to the follower of phantoms, or to the views in that of markers, as the extraction
+node does with those of a camera.
 """
 
 from __future__ import annotations
@@ -231,7 +232,6 @@ class MarkerSettings:
     calibrations: Calibrations = field(default_factory=dict)
     orientation: RigOrientation | None = None  #: of several fluoroscopes
     bodies: tuple[Body, ...] = ()  #: rigid groups of markers, if several fluoroscopes
-    later: tuple[int, ...] = ()  #: ids of markers whose positions are given later
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -248,8 +248,7 @@ class MarkerSettings:
 class MarkerFollower:
     """Follows markers in one view, or in several views jointly.
 
-    update() follows them from the first call on; extract() waits for images that show the markers
-    at their given first positions.
+    It begins with the first images that show the markers at their given positions.
     """
 
     def __init__(self, settings: MarkerSettings) -> None:
@@ -270,7 +269,7 @@ class MarkerFollower:
         if self._settings.first:
             self._follow(self._settings.first)
 
-    def _follow(self, first: Mapping[str, FirstMarkers | None]) -> None:
+    def _follow(self, first: Mapping[str, FirstMarkers | None]) -> MarkerViews:
         """Follow markers from their first positions. Raises DataError."""
         settings = self._settings
         self._views = MarkerViews(
@@ -279,28 +278,7 @@ class MarkerFollower:
             settings.options,
             first=first,
             bodies=settings.bodies,
-            later=settings.later,
         )
-
-    def place(self, fluoroscope: str, positions: FirstMarkers) -> None:
-        """Follow markers of a view from the positions that a person gives in the next image."""
-        self._begun_views.trackers[fluoroscope].place(positions)
-
-    def update(
-        self,
-        images: Mapping[str, np.ndarray | None],
-        number: int,
-        angles: Mapping[str, float | None] | None = None,
-    ) -> ViewsFrame:
-        """Return the markers in the images of an exposure; None: an image that cannot be read.
-
-        Parameters are those of extract(). Raises DataError.
-        """
-        return self._begun_views.update(images, number, angles)
-
-    @property
-    def _begun_views(self) -> MarkerViews:
-        assert self._views is not None
         return self._views
 
     def extract(
@@ -328,11 +306,10 @@ class MarkerFollower:
             missing = _missing_views(absent)
             return {name: Observations(finding=missing) for name in images}
         try:
-            if self._views is None:
-                self._identify(images, angles)
-            exposure = self.update(images, number, angles)
+            views = self._views or self._identified(images, angles)
+            exposure = views.update(images, number, angles)
             if not self._begun:
-                self._check_start(exposure)
+                self._check_start(exposure, views)
         except DataError as error:
             finding = error.finding
             return {
@@ -345,7 +322,7 @@ class MarkerFollower:
         out = {}
         for name, image in images.items():
             marker_frame = exposure.views[name]
-            result = _observed(marker_frame, len(self._begun_views.trackers[name].target_id))
+            result = _observed(marker_frame, len(views.trackers[name].target_id))
             decisions = [d for d in exposure.decisions if d.fluoroscope == name]
             earlier = self._earlier[name]
             retracted = [retraction for d in decisions for retraction in earlier.revise(d)]
@@ -356,21 +333,21 @@ class MarkerFollower:
             out[name] = replace(result, note=note, picture=picture, retracted=tuple(retracted))
         return out
 
-    def _identify(
+    def _identified(
         self, images: Mapping[str, np.ndarray], angles: Mapping[str, float | None] | None
-    ) -> None:
+    ) -> MarkerViews:
         """Start with the bodies that are identified by their shapes. Raises DataError."""
         settings = self._settings
         assert settings.orientation is not None
         first_markers = identify_markers(
             images, settings.calibrations, settings.orientation, settings.bodies, angles
         )
-        self._follow({name: first_markers.get(name) for name in settings.names})
+        return self._follow({name: first_markers.get(name) for name in settings.names})
 
-    def _check_start(self, exposure: ViewsFrame) -> None:
+    def _check_start(self, exposure: ViewsFrame, views: MarkerViews) -> None:
         """Accept the first exposure, or raise DataError to wait for another."""
         for name, view in exposure.views.items():
-            first_markers = self._begun_views.trackers[name].first
+            first_markers = views.trackers[name].first
             problem = (
                 None if first_markers is None else _wrong_start(view, len(first_markers.target_id))
             )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -51,22 +51,6 @@ class ImageCorrectionRequest:
     angles: Mapping[int, float] | None = None
 
 
-@dataclass(frozen=True)
-class _Task:
-    """File of a folder to correct."""
-
-    source: Path
-    out: Path
-
-
-@dataclass(frozen=True)
-class _Done:
-    """Result of a file: its number of images, or its problem."""
-
-    images: int
-    problem: str = ''
-
-
 def run_image_correction(
     request: ImageCorrectionRequest, progress: Progress | None = None
 ) -> CorrectedImages:
@@ -87,13 +71,11 @@ def run_image_correction(
     folder = list_images(request.source, request.recursive)
     with folder_like(request.out, folder) as temporary:
         outcomes = list(_corrected_files(request, folder, temporary, progress))
-        images = sum(outcome.images for outcome in outcomes)
-        failed = tuple(outcome.problem for outcome in outcomes if outcome.problem)
-        if not images:
+        counts = [outcome for outcome in outcomes if isinstance(outcome, int)]
+        failed = tuple(outcome for outcome in outcomes if isinstance(outcome, str))
+        if not sum(counts):
             raise DataError(f'none of {len(outcomes)} files can be corrected, {failed[0]}')
-    return CorrectedImages(
-        'folder', images, len(outcomes) - len(failed), folder.passed_over, failed
-    )
+    return CorrectedImages('folder', sum(counts), len(counts), folder.passed_over, failed)
 
 
 def _correct_by_angle(
@@ -110,22 +92,24 @@ def _correct_by_angle(
 
 def _corrected_files(
     request: ImageCorrectionRequest, folder: ImageFolder, out: Path, progress: Progress | None
-) -> Iterator[_Done]:
-    """Correct the files of a folder into another. Raises DataError, unless keep_going is set."""
+) -> Iterator[int | str]:
+    """Correct the files of a folder into another; yield the number of images of each.
+
+    A file that cannot be corrected raises DataError; with keep_going, yield its problem instead.
+    """
     # Absolute paths, valid for workers with another working directory.
     source = Path(os.path.abspath(folder.path))
-    tasks = [
-        _Task(source / file, out / target) for file, target in zip(folder.files, folder.written)
-    ]
+    tasks = [(source / file, out / name) for file, name in zip(folder.files, folder.written)]
     correct = partial(_correct_file, request.calibration, request.interpolation)
     with open_workers(_count(request, folder), request.scheduler, len(tasks)) as workers:
         for number, outcome in enumerate(workers.map(correct, tasks), 1):
-            problem = outcome.problem.replace(str(out), str(request.out))
-            if problem and request.scheduler is not None:
-                problem += ' (seen by a worker of the cluster)'
-            if problem and not request.keep_going:
-                raise DataError(problem)
-            yield replace(outcome, problem=problem)
+            if isinstance(outcome, str):
+                outcome = outcome.replace(str(out), str(request.out))
+                if request.scheduler is not None:
+                    outcome += ' (seen by a worker of the cluster)'
+                if not request.keep_going:
+                    raise DataError(outcome)
+            yield outcome
             if progress is not None:
                 progress(number, len(tasks))
 
@@ -142,13 +126,15 @@ def _count(request: ImageCorrectionRequest, folder: ImageFolder) -> int:
 _correctors: dict[tuple[str, str], ImageCorrector] = {}  # the last corrector of this process
 
 
-def _correct_file(calibration: FluoroscopeCalibration, interpolation: str, task: _Task) -> _Done:
-    """Correct a file in a worker."""
+def _correct_file(
+    calibration: FluoroscopeCalibration, interpolation: str, task: tuple[Path, Path]
+) -> int | str:
+    """Correct a file in a worker; return the number of its images, or its problem."""
     key = (calibration.calibration_id, interpolation)
     if key not in _correctors:
         _correctors.clear()
         _correctors[key] = ImageCorrector(calibration, interpolation)
     try:
-        return _Done(correct_images(task.source, task.out, _correctors[key]).images)
+        return correct_images(*task, _correctors[key]).images
     except DataError as error:
-        return _Done(0, str(error))
+        return str(error)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..bodies.body import Body
 from ..correction.angle_field import note_on_angles
 from ..correction.fluoroscope_calibration import Calibrations
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..exposures.decisions import Doubtful
 from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
@@ -30,13 +30,13 @@ from ..findings import Finding
 from ..images.codec import encode_overlay
 from ..images.marker_decisions import Decision, EarlierImages
 from ..images.marker_ids import identifiable, identify_markers
+from ..images.marker_views import MarkerViews
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.overlay import draw_markers
 from ..io.access import write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import one_core
 from .extraction import Progress, make_picture_folder
-from .followers import MarkerFollower, MarkerSettings
 from .image_sources import (
     ImageAngles,
     ImageSources,
@@ -249,7 +249,7 @@ def run_marker_extraction(
 
 
 class _Recording:
-    """Passes exposures to a follower, starting at the first with markers; revises its results."""
+    """Follows markers from the first exposure that shows them; revises the results."""
 
     def __init__(self, request: MarkerRequest) -> None:
         self._request = request
@@ -264,7 +264,7 @@ class _Recording:
         for name in self._names:
             if not self._given[name] and not by_shape:
                 raise DataError(f'there are no given markers of fluoroscope {name}')
-        self._follower: MarkerFollower | None = None
+        self._views: MarkerViews | None = None
         self._results: dict[str, list[MarkerImageResult]] = {name: [] for name in self._names}
         self._earlier = {name: EarlierImages() for name in self._names}
         self._decisions: list[Decision] = []
@@ -284,21 +284,21 @@ class _Recording:
     def add(self, images: Mapping[str, SourceImage]) -> None:
         """Track the markers through the images of one exposure, by fluoroscope."""
         exposure = next(iter(images.values())).exposure
-        if self._follower is None:
+        if self._views is None:
             first_markers = self._first_markers(images, exposure)
             if not first_markers:
                 for name in images:
                     self._before[name] += 1
                 return
-            self._follower = self._begin(images, first_markers)
+            self._views = self._begun(images, first_markers)
         for name in images if self._results[self._names[0]] else ():
             if exposure in self._given[name]:
-                self._follower.place(name, self._markers(name, exposure))
+                self._views.trackers[name].place(self._markers(name, exposure))
         arrays = {
             name: None if isinstance(image.image, DataError) else image.image
             for name, image in images.items()
         }
-        views_frame = self._follower.update(arrays, exposure, _angles_of(images))
+        views_frame = self._views.update(arrays, exposure, _angles_of(images))
         self._decisions += views_frame.decisions
         for decision in views_frame.decisions:
             self._earlier[decision.fluoroscope].revise(decision)
@@ -323,10 +323,8 @@ class _Recording:
     def _markers(self, name: str, exposure: int) -> FirstMarkers:
         """Return the given markers of an exposure. Raises DataError."""
         frame = self._given[name][exposure]
-        try:
+        with ErrorsAt(f'fluoroscope {name}, exposure {exposure}'):
             return FirstMarkers(frame.target_id, frame.uv)
-        except DataError as error:
-            raise DataError(f'fluoroscope {name}, exposure {exposure}: {error}') from None
 
     def _given_later(self) -> tuple[int, ...]:
         """Return ids of markers that are given for exposures after the first."""
@@ -364,32 +362,30 @@ class _Recording:
                 ) from None
             return {}
 
-    def _begin(
+    def _begun(
         self, images: Mapping[str, SourceImage], first: Mapping[str, FirstMarkers | None]
-    ) -> MarkerFollower:
-        """Return a follower starting at the first images. Raises DataError for a damaged image."""
+    ) -> MarkerViews:
+        """Return views starting at the first images. Raises DataError for a damaged image."""
         for name in self._names:
             image = images[name].image
             if isinstance(image, DataError):
                 raise image
             self._size[name] = (image.shape[1], image.shape[0])
         request = self._request
-        return MarkerFollower(
-            MarkerSettings(
-                first,
-                request.options,
-                request.calibrations,
-                request.orientation,
-                bodies=request.bodies,
-                later=self._given_later(),
-            )
+        return MarkerViews(
+            request.calibrations,
+            request.orientation,
+            request.options,
+            first=first,
+            bodies=request.bodies,
+            later=self._given_later(),
         )
 
     def outcome(self) -> MarkerOutcome:
         """Return all results. Raises DataError if tracking has not started."""
-        if self._follower is None and self._start is None:
+        if self._views is None and self._start is None:
             raise DataError(f'the markers are in no exposure: {self._reason or "no images"}')
-        if self._follower is None:
+        if self._views is None:
             raise DataError(
                 f'the markers are given for exposure {self._start}, but there is no image of it '
                 f'of {" and ".join(self._names)}'

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exposures.frame import Frame, Frames
+from ..exposures.frame import Frame
 from ..exposures.phantom import EXACT_SD_MM, Phantom
 from ..images.codec import encode
 from ..io.access import PathLike, make_folder, write_bytes, write_text
-from ..io.bags.writer import BagWriter
+from ..io.bags.writer import write_bag
 from ..io.bodies import COLUMNS as POSE_COLUMNS
 from ..io.bodies import JOINT_COLUMNS as JOINT_COLUMNS
 from ..io.bodies import joint_definition, write_bodies
@@ -78,14 +78,6 @@ CLUSTERS = 'clusters.txt'  # rigid groups of markers, one line per cluster
 TRUTH = 'truth'  # folder of the true values of a data set
 
 
-def write_bag(path: PathLike, frames: Frames) -> None:
-    """Write frames as a bag folder, ordered by stamp. Raises DataError."""
-    recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
-    with BagWriter(path, overwrite=True) as bag:
-        for frame in sorted(recorded, key=lambda f: f.stamp_ns):
-            bag.write_frame(frame)
-
-
 def _rows(
     begin: Sequence[object],
     ids: Iterable[object],
@@ -98,14 +90,13 @@ def _rows(
 
 
 def write_exposures(
-    directory: PathLike, name: str, rig: VirtualRig, simulated: SimulatedExposures
+    directory: Path, name: str, rig: VirtualRig, simulated: SimulatedExposures
 ) -> None:
     """Write exposures as NAME (bag) and NAME.csv, with their truth.
 
     truth/NAME_exposures.csv contains the exterior orientations, truth/NAME_undistorted.csv the
     observed points after a perfect correction. Raises DataError.
     """
-    directory = Path(directory)
     write_bag(directory / name, simulated.frames)
     write_observations_csv(directory / f'{name}.csv', simulated.frames)
     undistorted_frames = {
@@ -127,7 +118,7 @@ def write_exposures(
 
 
 def write_radiographs(
-    directory: PathLike,
+    directory: Path,
     rig: VirtualRig,
     simulated: SimulatedExposures,
     settings: RadiographSettings,
@@ -138,7 +129,6 @@ def write_radiographs(
     truth/images.csv contains the centres of all beads in the field of view. progress is called
     after every image with the number of finished images and their total. Raises DataError.
     """
-    directory = Path(directory)
     rows: list[list[object]] = []
     total = len(rig.fluoroscopes) * len(simulated.poses)
     done = 0
@@ -160,7 +150,7 @@ def write_radiographs(
 
 
 def write_marker_radiographs(
-    directory: PathLike,
+    directory: Path,
     sequence: MarkerSequence,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -171,7 +161,6 @@ def write_marker_radiographs(
     of all markers, with 1 for visible ones; truth/marker_images_points.csv their points in space
     [mm]. progress is called as by `write_radiographs`. Raises DataError.
     """
-    directory = Path(directory)
     markers = sequence.markers
     names = [fluoroscope.name for fluoroscope in sequence.rig.fluoroscopes]
     for name in names:
@@ -217,9 +206,8 @@ def _first_markers(
     }
 
 
-def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:
+def write_tracking(directory: Path, tracking: SimulatedTracking) -> None:
     """Write a recording of markers as the bag tracking, and truth/markers.csv."""
-    directory = Path(directory)
     write_bag(directory / 'tracking', tracking.frames)
     numbers = [frame.number for frame in next(iter(tracking.frames.values()))]
     rows = (
@@ -231,20 +219,18 @@ def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:
     Table(header, rows).write(directory / TRUTH / 'markers.csv')
 
 
-def write_knee(directory: PathLike, knee: VirtualKnee) -> None:
+def write_knee(directory: Path, knee: VirtualKnee) -> None:
     """Write bodies.csv and joints.toml of a knee, and truth/bodies.csv. Raises DataError."""
-    directory = Path(directory)
     write_bodies(directory / BODIES, knee.surveyed)
     write_bodies(directory / TRUTH / BODIES, knee.bodies)
     write_text(directory / JOINTS, joint_definition(knee.joint, knee.landmarks))
 
 
-def write_knee_recording(directory: PathLike, name: str, recording: SimulatedKnee) -> None:
+def write_knee_recording(directory: Path, name: str, recording: SimulatedKnee) -> None:
     """Write a recording of a knee as the bag NAME, with truth/NAME_poses.csv and NAME_joints.csv.
 
     Their columns are the first ones of poses.csv and joints.csv. Raises DataError.
     """
-    directory = Path(directory)
     write_bag(directory / name, recording.frames)
     motion = recording.motion
     numbers = [frame.number for frame in next(iter(recording.frames.values()))]
@@ -261,12 +247,11 @@ def write_knee_recording(directory: PathLike, name: str, recording: SimulatedKne
     Table(JOINT_COLUMNS[:9], rows).write(directory / TRUTH / f'{name}_joints.csv')
 
 
-def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) -> None:
+def write_rig(directory: Path, rig: VirtualRig, options: Mapping[str, Any]) -> None:
     """Write phantom.csv (the survey), truth/phantom.csv (true coordinates) and truth/rig.json.
 
     options: those of the simulation. Raises DataError.
     """
-    directory = Path(directory)
     make_folder(directory / TRUTH)
     write_phantom(directory / 'phantom.csv', rig.phantom)
     write_phantom(
@@ -283,19 +268,12 @@ def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) 
 
 
 def _fluoroscope(fluoroscope: VirtualFluoroscope) -> dict[str, Any]:
-    distortion = fluoroscope.distortion
     return {
         'interior': dict(zip(('xp', 'yp', 'c'), fluoroscope.interior)),
         'image_size': list(fluoroscope.image_size),
         'position_mm': fluoroscope.position_mm,
         'quaternion_wxyz': quaternion_from_matrix(fluoroscope.rotation),
-        'distortion': {
-            'centre': distortion.centre,
-            'pincushion': distortion.pincushion,
-            's_shape': distortion.s_shape,
-            'spiral': distortion.spiral,
-            'ripples': distortion.ripples,
-        },
+        'distortion': vars(fluoroscope.distortion),
     }
 
 

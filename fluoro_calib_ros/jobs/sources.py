@@ -328,8 +328,6 @@ def read_calibrations(
     Raises DataError for a folder without calibrations, a missing calibration, and a damaged file.
     """
     calibrations = load_calibrations(directory)
-    if not calibrations:
-        raise DataError(f'{directory}: there is no calibration in this folder')
     return select_calibrations(
         calibrations, calibrations if fluoroscopes is None else fluoroscopes, directory
     )

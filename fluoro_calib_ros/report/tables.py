@@ -155,20 +155,22 @@ def markdown_table(header: Sequence[Any], rows: Sequence[Sequence[Any]]) -> str:
     for row in cells:
         if len(row) != len(titles):
             raise ValueError(f'a row has {len(row)} cells, the header has {len(titles)}')
-    columns = list(zip(titles, *cells))
-    widths = [max(3, *map(len, column)) for column in columns]
-    right_aligned = [len(column) > 1 and all(map(_is_number, column[1:])) for column in columns]
-    rule = [
-        '-' * (width - 1) + ':' if r else '-' * width for width, r in zip(widths, right_aligned)
+    columns = zip(titles, *cells)
+    is_right = [len(column) > 1 and all(map(_is_number, column[1:])) for column in columns]
+    head, *body = _aligned([titles, *cells], is_right, 3)
+    rule = ['-' * (len(cell) - r) + ':' * r for cell, r in zip(head, is_right)]
+    return ''.join('| ' + ' | '.join(row) + ' |\n' for row in [head, rule, *body])
+
+
+def _aligned(
+    rows: Sequence[Sequence[str]], is_right: Sequence[bool], least: int = 0
+) -> list[list[str]]:
+    """Pad the cells of columns to a common width of at least `least` characters."""
+    widths = [max(least, *map(len, column)) for column in zip(*rows)]
+    return [
+        [c.rjust(width) if r else c.ljust(width) for c, width, r in zip(row, widths, is_right)]
+        for row in rows
     ]
-    lines = []
-    for row in [titles, rule, *cells]:
-        aligned = [
-            cell.rjust(width) if r else cell.ljust(width)
-            for cell, width, r in zip(row, widths, right_aligned)
-        ]
-        lines.append('| ' + ' | '.join(aligned) + ' |')
-    return '\n'.join(lines) + '\n'
 
 
 def _cell(value: Any) -> str:
@@ -242,18 +244,8 @@ def verdict_text(validation: Validation) -> str:
                 PASSED_TEXT[check.passed],
             )
         )
-    widths = [max(map(len, column)) for column in zip(*rows)]
-    lines = []
-    for name, fluoroscope, value, limit, unit, passed in rows:
-        cells = [
-            name.ljust(widths[0]),
-            fluoroscope.ljust(widths[1]),
-            value.rjust(widths[2]),
-            limit.rjust(widths[3]),
-            unit.ljust(widths[4]),
-            passed,
-        ]
-        lines.append('  '.join(cells).rstrip())
+    is_right = [title in ('value', 'limit') for title in HEADER]
+    lines = ['  '.join(cells).rstrip() for cells in _aligned(rows, is_right)]
     lines += ['', f'Verdict: {validation.verdict} ({validation.seconds:.1f} s)']
     for name, sd in validation.achieved_sd_px.items():
         lines.append(f'Achieved, fluoroscope {_shortened(name)}: corrections to {sd:.3f} px (sd)')

@@ -9,10 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import calibrated, run
+from rigs import calibrated, create_model, run
 
 from fluoro_calib_ros.checks.comparison import compare_calibrations
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.jobs.result_folder import save_result
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, matrix_from_vector

@@ -24,8 +24,8 @@ from scipy.spatial.distance import pdist
 from fluoro_calib_ros.cli import COMMANDS, main, make_parser
 from fluoro_calib_ros.cli.arguments import input_paths
 from fluoro_calib_ros.correction.base import CorrectionStatus
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.calibration import load_calibration
-from fluoro_calib_ros.jobs.simulation import write_bag
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 IMAGE = ('--image-size', '1024x1024')

@@ -18,7 +18,7 @@ import pytest
 
 import fluoro_calib_ros as fc
 from fluoro_calib_ros import api
-from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.io.bags.writer import write_bag
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / 'examples'

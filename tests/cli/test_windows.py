@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from rigs import exposures
 
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.calibration import load_calibrations
-from fluoro_calib_ros.jobs.simulation import write_bag
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 

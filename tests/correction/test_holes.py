@@ -4,9 +4,9 @@
 
 import numpy as np
 import pytest
+from rigs import create_model
 
 from fluoro_calib_ros.correction.grid import CorrectionGrid
-from fluoro_calib_ros.correction.registry import create_model
 
 SIDE = 1024
 HOLE = np.array([450.0, 560.0])

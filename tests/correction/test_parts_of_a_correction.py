@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import pincushion, turning
+from rigs import create_model, pincushion, turning
 from scipy.spatial import cKDTree
 
 from fluoro_calib_ros.api import DataError, correct
@@ -25,7 +25,6 @@ from fluoro_calib_ros.correction.grid_cells import (
     errors_where_curved,
 )
 from fluoro_calib_ros.correction.neighbours import KnnModel, blocks_with_candidates
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.correction.series import MARGIN, Functions, without_absent_bands
 
 SIZE = (320, 240)

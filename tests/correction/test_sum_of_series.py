@@ -5,12 +5,11 @@
 
 import numpy as np
 import pytest
-from rigs import calibrated, rig, true_calibrations
+from rigs import calibrated, create_model, rig, true_calibrations
 
 from fluoro_calib_ros.correction.base import CorrectionModel
 from fluoro_calib_ros.correction.calibration_record import SD_GRID
 from fluoro_calib_ros.correction.fluoroscope_calibration import with_drift, with_larger_sd
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.errors import DataError
 

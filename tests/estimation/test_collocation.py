@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rigs
+from rigs import create_model
 from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 from scipy.special import gamma, kv
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.correction.calibration_record import SD_GRID
-from fluoro_calib_ros.correction.registry import MODELS, create_model
+from fluoro_calib_ros.correction.registry import MODELS
 from fluoro_calib_ros.correction.series import (
     Functions,
     Series,

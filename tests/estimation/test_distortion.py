@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rigs
+from rigs import create_model
 from scipy.spatial import ConvexHull, Delaunay
 from scipy.spatial.transform import Rotation
 from sklearn.model_selection import GridSearchCV, GroupKFold, PredefinedSplit
@@ -22,7 +23,7 @@ from fluoro_calib_ros.correction.neighbours import (
     Trend,
     least_squares_map,
 )
-from fluoro_calib_ros.correction.registry import MODELS, create_model, no_correction
+from fluoro_calib_ros.correction.registry import MODELS, no_correction
 from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.estimation.estimator import (
     GaugeKind,

@@ -13,13 +13,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rigs
+from rigs import create_model
 from scipy.spatial import Delaunay
 
 from fluoro_calib_ros.correction import grid_cells
 from fluoro_calib_ros.correction.base import CorrectionStatus
 from fluoro_calib_ros.correction.grid import CHUNK, DIVIDED, CorrectionGrid
 from fluoro_calib_ros.correction.grid_cells import LIMIT_PX
-from fluoro_calib_ros.correction.registry import create_model, no_correction
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import points_on_image
 

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rigs
+from rigs import create_model
 
 from fluoro_calib_ros.correction.calibration_record import SD_GRID
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.correction.series import Functions, Series, sd_grid_pixels
 from fluoro_calib_ros.estimation.collocation import CollocationTerms
 from fluoro_calib_ros.estimation.estimator import (

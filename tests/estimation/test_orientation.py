@@ -23,6 +23,7 @@ from fluoro_calib_ros.estimation.rig_orientation import (
 )
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.calibration import (
     ORIENTATION_FIELDS,
     load_orientation,
@@ -30,7 +31,6 @@ from fluoro_calib_ros.io.calibration import (
     save_orientation,
 )
 from fluoro_calib_ros.io.observations import write_observations_csv
-from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.rig_orientation import (
     datum_transformation,

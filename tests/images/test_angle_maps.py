@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import rigs
 import turning_rig
+from rigs import create_model
 
 from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.correction.angle_field import AngleField, harmonics
 from fluoro_calib_ros.correction.base import CorrectionStatus
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.angle_maps import AngleMaps, _rate
 from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector

@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rigs
+from rigs import create_model
 from scipy.ndimage import map_coordinates
 
 from benchmarks.bead_images import BEAD_PX, background, bead_image
 from fluoro_calib_ros.correction.base import CorrectionStatus
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
 

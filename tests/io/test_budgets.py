@@ -34,10 +34,10 @@ from fluoro_calib_ros.io import access
 from fluoro_calib_ros.io.bags import reader as reader_module
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
 from fluoro_calib_ros.io.bags.salvage import inspect_bag
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.calibration import load_calibration, save_calibration
 from fluoro_calib_ros.io.documents import parse_yaml
 from fluoro_calib_ros.io.formats.native import read_known_orientations
-from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.simulation.rig import simulate_exposures
 
 MEGABYTES = 40

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs import create_model
 
 from fluoro_calib_ros.correction.angle_field import AngleField, packed_angles
 from fluoro_calib_ros.correction.calibration_record import FIELDS
@@ -19,7 +20,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import (
     FluoroscopeCalibration,
     NoiseProfile,
 )
-from fluoro_calib_ros.correction.registry import create_model, no_correction
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.names import Names

@@ -20,7 +20,7 @@ from fluoro_calib_ros.io.bags.metadata import (
     typestore,
 )
 from fluoro_calib_ros.io.bags.reader import read_frames, topics_of
-from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.jobs.sources import BagSelection, read_source
 from fluoro_calib_ros.limits import ReadLimits, use_read_limits
 

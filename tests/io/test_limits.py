@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 import rigs
+from rigs import create_model
 
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.images.codec import decode

@@ -83,7 +83,7 @@ def test_the_columns_of_a_header_may_have_any_order(tmp_path):
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,"1,5",0,0\n3,0,9,0\n', 'with semicolons between the'),
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0,0\n1.0,0,9,0\n', "row 4: bead '1' is already"),
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0\n3,0,9,0\n', 'row 3: 3 columns'),
-        ('id,x_mm,y_mm,z_mm,sd\n1,0,0,0,0\n2,9,0,0,1\n', 'row 2: sd is not above 0'),
+        ('id,x_mm,y_mm,z_mm,sd\n1,0,0,0,0\n2,9,0,0,1\n', "row 2: sd is '0', not above 0"),
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0,0\n3,0,9,0\n', '3 targets are too few'),
         ('1 0 0 0\n99999999999999999999 9 0 0\n3 0 9 0\n4 0 0 9\n', 'row 2: id is'),
         ('1 0 0 0\n2 9 0 0\n3 0 9 0\n4 0 0 9\n', '--units mm|cm|m is needed'),

@@ -29,8 +29,7 @@ from fluoro_calib_ros.io.bags.metadata import (
 )
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
 from fluoro_calib_ros.io.bags.salvage import FileSalvage, _decompressed, recover_bag
-from fluoro_calib_ros.io.bags.writer import BagWriter
-from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.io.bags.writer import BagWriter, write_bag
 from fluoro_calib_ros.limits import MAX_CHUNK
 from fluoro_calib_ros.simulation.rig import StreamStart, simulate_tracking, virtual_rig
 

@@ -12,10 +12,10 @@ import rigs
 import fluoro_calib_ros as fc
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.csv_table import read_names
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.jobs import sources
-from fluoro_calib_ros.jobs.simulation import write_bag
 
 COUNT = 6  # exposures
 QUICK = fc.CalibrationOptions(model='none', max_iterations=1)

@@ -15,18 +15,17 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.io.bags.mcap_file import is_bag
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.calibration import RESULT_NAME, save_calibration, save_orientation
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.io.observations import read_observations_csv, write_observations_csv
 from fluoro_calib_ros.jobs.conversion import (
-    BAG,
     ConversionRequest,
     convert,
     is_result_folder,
     result_content,
     stations_of,
 )
-from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.jobs.sources import read_calibrated_source
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion
 
@@ -97,7 +96,7 @@ def points_of(path):
 
 def test_table_and_bag_hold_the_same_points(table, tmp_path):
     bag = tmp_path / 'bag'
-    assert convert(request(table, BAG, bag)).paths == (str(bag),)
+    assert convert(request(table, 'bag', bag)).paths == (str(bag),)
     again = tmp_path / 'again.csv'
     written = convert(request(bag, 'observations', again))
     assert list(written.paths) == [str(again)] and written.notes == ()
@@ -154,8 +153,8 @@ def test_what_belongs_to_another_kind_of_source_is_refused(table, result, tmp_pa
     with pytest.raises(DataError, match='needs a bag'):
         convert(request(table, 'observations', out, angles=joint))
     (result / 'observations.csv').unlink()
-    with pytest.raises(DataError, match='a bag needs image points'):
-        convert(request(result, BAG, tmp_path / 'bag'))
+    with pytest.raises(DataError, match='bag as rosbag2 writes it needs image points'):
+        convert(request(result, 'bag', tmp_path / 'bag'))
     assert not out.exists() and not (tmp_path / 'bag').exists()
 
 

@@ -17,9 +17,9 @@ import pytest
 import rigs
 from fluoro_calib_msgs.srv import Calibrate
 from rclpy.serialization import serialize_message
+from rigs import create_model
 from sensor_msgs.msg import Image
 
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.images.corrector import ImageCorrector

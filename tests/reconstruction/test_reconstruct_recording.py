@@ -17,9 +17,9 @@ from fluoro_calib_ros.checks.drift_charts import ERROR, DriftOptions
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.findings import Kind, Severity
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
 from fluoro_calib_ros.io.observations import write_observations_csv
-from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (
     CorrectedView,

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs import create_model
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import BodyPoses, PoseStatus
 from fluoro_calib_ros.bodies.joints import Joint, JointStatus, joint_motion
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.report.figures import (
     Scale,
     _field_on_grid,

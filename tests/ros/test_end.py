@@ -12,10 +12,9 @@ from subprocess import PIPE
 import numpy as np
 import pytest
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
-from rigs import calibrated
+from rigs import calibrated, create_model
 from ros_graph import ROOT
 
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fluoro_calib_msgs.msg import FluoroscopeCalibration, RigOrientation
+from rigs import create_model
 from ros_graph import ROOT, Process, value_of
 
-from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.io.calibration import load_calibration
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration

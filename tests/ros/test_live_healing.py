@@ -19,12 +19,12 @@ from test_reconstruction import coordinates
 from test_web import page
 
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.calibration import load_calibrations, load_orientation, orientation_path
 from fluoro_calib_ros.io.versions import LEARNED_SHAPES, read_learned_shapes
 from fluoro_calib_ros.jobs.healing import BLOCKS
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions
-from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.messages.points import PointsContent, encode_reconstructed_points
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector

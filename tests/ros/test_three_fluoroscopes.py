@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from ros_graph import entry_point, value_of
 
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime.topics import observations_qos
 from fluoro_calib_ros.simulation.rig import (

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from ...errors import DataError
-from ...exposures.frame import Frame
+from ...exposures.frame import Frame, Frames
 from ..access import PathLike, hidden_path, os_errors, sync_folder, write_text
 from ..folder import PREVIOUS, put_in_place
 from .metadata import (
@@ -275,6 +275,14 @@ class BagWriter:
             self._file.close()
         if not self._live:
             shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def write_bag(path: PathLike, frames: Frames) -> None:
+    """Write frames as a bag folder, ordered by stamp. Raises DataError."""
+    recorded = [frame for view_frames in frames.values() for frame in view_frames]
+    with BagWriter(path, overwrite=True) as bag:
+        for frame in sorted(recorded, key=lambda f: f.stamp_ns):
+            bag.write_frame(frame)
 
 
 def check_topic_name(topic: str, path: str) -> None:

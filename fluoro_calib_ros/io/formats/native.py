@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Formats of this package: observations, phantom, points, distortion grid, known orientations.
+"""Formats of this package: bag, observations, phantom, points, grid, known orientations.
 
 Targets, exposures and fluoroscopes may have names instead of ids.
 
@@ -24,6 +24,7 @@ from ...exposures.names import Names, without_trivial
 from ...exposures.phantom import first_repeated
 from ...photogrammetry.rig_orientation import KnownOrientation
 from ..access import PathLike, read_text, write_text
+from ..bags.writer import write_bag
 from ..bodies import NAME_COLUMN
 from ..bodies import POINT_COLUMNS as POINTS
 from ..csv_table import Table, has_columns, read_all
@@ -46,6 +47,12 @@ from .tables import rate_of
 
 POINTS_NEEDED = ('frame', 'target_id', 'x', 'y', 'z')
 GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
+
+
+def _write_bag(path: Path, content: Content, settings: FileSettings) -> Written:
+    assert content.observations is not None
+    write_bag(path, content.observations)
+    return Written((str(path),))
 
 
 def _read_observations(path: Path, settings: FileSettings) -> Content:
@@ -165,6 +172,15 @@ def _write_grid(path: Path, content: Content, settings: FileSettings) -> Written
 
 _OWN = 'CSV of fluoro_calib_ros'
 FORMATS = (
+    # Bags are read by the jobs, which also need other topics, such as the angles of C-arms.
+    Format(
+        'bag',
+        'MCAP bag as rosbag2 writes it',
+        parts=('observations',),
+        recognise=lambda sample: False,
+        read=None,
+        write=_write_bag,
+    ),
     Format(
         'observations',
         f'image points, {_OWN}',

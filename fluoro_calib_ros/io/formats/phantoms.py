@@ -13,21 +13,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError, ErrorsAt, quoted
-from ...exposures.names import MAX_ID, Names, number_names, without_trivial
+from ...exposures.names import Names, number_names, without_trivial
 from ...exposures.phantom import Phantom
-from ...findings import sentence_of
 from ...limits import read_limits
 from ..access import read_text, write_text
-from ..csv_table import decimal_comma_advice, is_number, without_zeros
+from ..csv_table import Block, is_number, without_zeros
 from .content import UNITS_MM, Content, FileSettings, Format, Sample, Written, from_units, in_units
-from .tables import Row, check_labels, joined, separator_of, table_of
+from .tables import Row, check_labels, joined, require_width, separator_of, table_of
 
 _COLUMN = re.compile(r'"?([a-z]+)(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?"?')
 # Synonyms of column names.
@@ -38,16 +36,7 @@ _SAME = {
 }
 # Columns of other files with coordinates; their own readers report what is missing.
 _OTHERS = {'target_id', 'frame', 'exposure'}
-_KNOWN = ('id', 'x', 'y', 'z', 'sd', 'diameter')
 MOST_CELLS = 12  # maximum number of columns in the header of a bead list
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Column numbers by name, and the unit in the header, None if it states none."""
-
-    columns: dict[str, int]
-    unit: str | None = None
 
 
 def _is_coordinates(sample: Sample) -> bool:
@@ -61,7 +50,7 @@ def _is_coordinates(sample: Sample) -> bool:
     if header is not None:
         return len(rows[0]) <= MOST_CELLS
     return all(
-        _without_header(row) == _without_header(rows[0]) != () for row in rows[1:-1] or rows
+        _without_header(row) == _without_header(rows[0]) != [] for row in rows[1:-1] or rows
     )
 
 
@@ -71,33 +60,31 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
     lines = ['' if line.lstrip().startswith('#') else line for line in text.splitlines()]
     separator = _separator([line.strip() for line in lines if line.strip()])
     rows = table_of(path, '\n'.join(lines), separator)
-    layout = _header(rows[0].cells)
-    beads = rows if layout is None else rows[1:]
-    if not beads:
+    header = _header(rows[0].cells)
+    names, unit = header or (_without_header(rows[0].cells), None)
+    lines_of_beads = rows if header is None else rows[1:]
+    if not lines_of_beads:
         raise DataError(f'{path}: the file has a header, but no beads')
     max_targets = read_limits().max_targets
-    if len(beads) > max_targets:
+    if len(lines_of_beads) > max_targets:
         raise DataError(f'{path}: phantoms of more than {max_targets} targets are not read')
-    if layout is None:
-        names = _without_header(rows[0].cells)
-        if not names:
-            rows[0].fail(
-                f'{len(rows[0].cells)} columns without a header that names x, y and z; a bead is '
-                'x y z, id x y z or x y z name'
-            )
-        layout = _Layout({name: number for number, name in enumerate(names)})
-    for row in beads:
-        if len(row.cells) != len(rows[0].cells):
-            row.fail(f'{len(row.cells)} columns, but the first row has {len(rows[0].cells)}')
-    mm = _unit(path, layout, settings)
-    xyz = from_units(np.array([_numbers(row, layout, ('x', 'y', 'z')) for row in beads]), mm)
+    if not names:
+        rows[0].fail(
+            f'{len(rows[0].cells)} columns without a header that names x, y and z; a bead is '
+            'x y z, id x y z or x y z name'
+        )
+    require_width(lines_of_beads, len(rows[0].cells), 'the first row')
+    cells, numbers = zip(*((row.cells, row.line) for row in lines_of_beads))
+    beads = Block(path, names, list(cells), np.array(numbers))
+    mm = _unit(path, unit, settings)
+    xyz = from_units(np.column_stack([beads.floats(axis) for axis in 'xyz']), mm)
     notes: tuple[str, ...] = ()
-    if 'sd' in layout.columns:
-        sd = _positive(beads, layout, 'sd') * mm
+    if 'sd' in beads:
+        sd = beads.positive('sd') * mm
     else:
-        sd, notes = _sd_unsaid(path, len(beads), settings)
-    diameter = _positive(beads, layout, 'diameter') * mm if 'diameter' in layout.columns else None
-    ids = _ids(beads, layout)
+        sd, notes = _sd_unsaid(path, len(cells), settings)
+    diameter = beads.positive('diameter') * mm if 'diameter' in beads else None
+    ids = _ids(beads)
     with ErrorsAt(path):
         survey = Phantom(np.array(list(ids.values())), xyz, sd, diameter)
     return Content(survey=survey, names=Names(without_trivial(ids)), notes=notes)
@@ -109,84 +96,62 @@ def _separator(lines: Sequence[str]) -> str:
     return next((mark for mark in ';\t,' if mark in sample_line), ' ')
 
 
-def _header(cells: Sequence[str]) -> _Layout | None:
-    """Return the layout given by a header, None if the row is not a header."""
-    columns: dict[str, int] = {}
+def _header(cells: Sequence[str]) -> tuple[list[str], str | None] | None:
+    """Return names of columns and the unit in a header, None if the row is not a header.
+
+    A column without a meaning is called ''; the unit is None if the header states none.
+    """
+    names: list[str] = []
     units = set()
-    for number, cell in enumerate(cells):
+    for cell in cells:
         match = _COLUMN.fullmatch(cell.strip().lower())
-        if match is None:
-            continue
-        name = _SAME.get(match[1], match[1])
-        if name in columns:
+        name = '' if match is None else _SAME.get(match[1], match[1])
+        if name and name in names:
             return None
-        columns[name] = number
-        if match[2] and name in ('x', 'y', 'z'):
+        names.append(name)
+        if match is not None and match[2] and name in ('x', 'y', 'z'):
             units.add(match[2])
-    if not {'x', 'y', 'z'} <= set(columns) or _OTHERS & {cell.lower() for cell in cells}:
+    if not {'x', 'y', 'z'} <= set(names) or _OTHERS & {cell.lower() for cell in cells}:
         return None
-    known_columns = {name: columns[name] for name in _KNOWN if name in columns}
-    return _Layout(known_columns, ''.join(units) if len(units) == 1 else None)
+    return names, ''.join(units) if len(units) == 1 else None
 
 
-def _without_header(cells: Sequence[str]) -> tuple[str, ...]:
-    """Return the column names of a row without a header, () if the row fits no such layout."""
+def _without_header(cells: Sequence[str]) -> list[str]:
+    """Return the column names of a row without a header, [] if the row fits no such layout."""
     numbers = [is_number(cell) for cell in cells]
     if len(cells) == 3 and all(numbers):
-        return 'x', 'y', 'z'
+        return ['x', 'y', 'z']
     if len(cells) == 4 and all(numbers[1:]) and (cells[0].isdigit() or not numbers[0]):
-        return 'id', 'x', 'y', 'z'
+        return ['id', 'x', 'y', 'z']
     if len(cells) == 4 and all(numbers[:3]) and not numbers[3]:
-        return 'x', 'y', 'z', 'id'
-    return ()
+        return ['x', 'y', 'z', 'id']
+    return []
 
 
-def _unit(path: Path, layout: _Layout, settings: FileSettings) -> float:
+def _unit(path: Path, unit: str | None, settings: FileSettings) -> float:
     """Return the unit in mm. Raises DataError if header and user contradict each other."""
-    if layout.unit is None:
+    if unit is None:
         return settings.unit_read(path)
-    if settings.units not in (None, layout.unit):
-        raise DataError(f'{path}: the header has {layout.unit}, but --units is {settings.units}')
-    return UNITS_MM[layout.unit]
+    if settings.units not in (None, unit):
+        raise DataError(f'{path}: the header has {unit}, but --units is {settings.units}')
+    return UNITS_MM[unit]
 
 
-def _numbers(row: Row, layout: _Layout, names: Sequence[str]) -> list[float]:
-    """Return the numbers of some columns. Raises DataError that names the column."""
-    numbers = []
-    for name in names:
-        cell = row.cells[layout.columns[name]]
-        if not is_number(cell) or not np.isfinite(float(cell)):
-            cause = f'{name} is {quoted(cell)}, not a finite number'
-            row.fail(sentence_of(cause, decimal_comma_advice(cell)))
-        numbers.append(float(cell))
-    return numbers
-
-
-def _positive(rows: Sequence[Row], layout: _Layout, name: str) -> NDArray[np.float64]:
-    values = np.array([_numbers(row, layout, (name,))[0] for row in rows])
-    if not (values > 0).all():
-        rows[int(np.argmin(values > 0))].fail(f'{name} is not above 0')
-    return values
-
-
-def _ids(rows: Sequence[Row], layout: _Layout) -> dict[str, int]:
+def _ids(beads: Block) -> dict[str, int]:
     """Return the ids by name, in the order of the rows. Raises DataError for a repeated name."""
-    if 'id' not in layout.columns:
-        return {str(number): number for number in range(1, len(rows) + 1)}
-    cells = [without_zeros(row.cells[layout.columns['id']]) for row in rows]
-    first_rows: dict[str, Row] = {}
-    for row, cell in zip(rows, cells):
+    if 'id' not in beads:
+        return {str(number): number for number in range(1, len(beads.rows) + 1)}
+    cells = list(map(without_zeros, beads.strings('id')))
+    first_rows: dict[str, int] = {}
+    for index, cell in enumerate(cells):
         if not cell:
-            row.fail('the bead has no id')
-        first_row = first_rows.setdefault(cell, row)
-        if first_row is not row:
-            row.fail(f'bead {quoted(cell)} is already given in row {first_row.line}')
+            beads.fail(index, 'the bead has no id')
+        first = first_rows.setdefault(cell, index)
+        if first != index:
+            beads.fail(index, f'bead {quoted(cell)} is already given in row {beads.lines[first]}')
     if not all(cell.isascii() and cell.isdigit() for cell in cells):
         return number_names(cells)
-    for row, cell in zip(rows, cells):
-        if len(cell) > len(str(MAX_ID)) or int(cell) > MAX_ID:
-            row.fail(f'id is {quoted(cell)}, not between 0 and {MAX_ID}')
-    return {cell: int(cell) for cell in cells}
+    return dict(zip(cells, beads.ids('id').tolist()))
 
 
 COORDINATES = Format(

@@ -283,7 +283,7 @@ def rigid_clusters(
         error(f'--cluster: {fault}')
 
 
-def options_of(kind: type[T], arguments: argparse.Namespace, **values: Any) -> T:
+def options_of(kind: type[T], arguments: argparse.Namespace, /, **values: Any) -> T:
     """Return a dataclass of options, or of a request, from the arguments of the same names.
 
     values replace them; a field without an argument keeps its default. Raises ValueError.

@@ -204,10 +204,15 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
         joint_convention = convention(texts['convention'])
         joint_convention.check_side(texts['side'])
         frames = {
-            f'{end}_frame': _frame(joint_convention, end, table.get(f'{end}_frame'), texts['side'])
+            end: _frame(joint_convention, end, table.get(f'{end}_frame'), texts['side'])
             for end in ('proximal', 'distal')
         }
-        joint = Joint(**texts, **frames)
+        joint = Joint(
+            *(texts[key] for key in REQUIRED),
+            proximal_frame=frames['proximal'],
+            distal_frame=frames['distal'],
+            side=texts['side'],
+        )
     return JointEntry(joint, _neutral(where, table.get('neutral')))
 
 

@@ -15,7 +15,7 @@ import hashlib
 import os
 import shlex
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -269,15 +269,6 @@ def _option_words(key: str, value: Any, error: Callable[[str], NoReturn]) -> lis
     return [f'{word}={value}']
 
 
-@dataclass(frozen=True)
-class _Started:
-    """A running step."""
-
-    step: Step
-    digest: str  #: digest of its inputs when it was started
-    process: subprocess.Popen[Any]
-
-
 class _Work:
     """Runs steps as programs, and skips those that were completed earlier."""
 
@@ -294,49 +285,41 @@ class _Work:
 
     def run(self, chains: Iterable[Sequence[Step]], workers: int) -> None:
         """Run chains of steps, at most `workers` at a time; a chain stops at a failed step."""
-        waiting = deque((number, deque(chain)) for number, chain in enumerate(chains, 1))
-        total = len(waiting)
-        running: list[tuple[tuple[int, deque[Step]], _Started]] = []
+        chains = list(chains)
+        waiting = [self._run(c, f'{n} of {len(chains)}') for n, c in enumerate(chains, 1)]
+        running: list[Iterator[None]] = []
         while waiting or running:
-            while waiting and len(running) < workers:
-                number, steps = chain = waiting.popleft()
-                started = self._next(steps, f'{number} of {total}')
-                if started is not None:
-                    running.append((chain, started))
-            for entry in list(running):
-                chain, started = entry
-                if started.process.poll() is None:
-                    continue
-                running.remove(entry)
-                if self._ended(started).ok:
-                    waiting.appendleft(chain)
+            free = workers - len(running)
+            running += waiting[:free]
+            del waiting[:free]
+            running = [chain for chain in running if next(chain, 'ended') != 'ended']
             time.sleep(POLL_S if running else 0)
 
-    def _next(self, chain: deque[Step], place: str) -> _Started | None:
-        """Start the first incomplete step of a chain; return None if there is none."""
+    def _run(self, chain: Sequence[Step], place: str) -> Iterator[None]:
+        """Run the incomplete steps of a chain until one fails; yield while a program runs."""
+        for step in chain:
+            digest = digest_of(step)
+            done = self._kept(step, digest)
+            if done is None:
+                process = self._started(step, place)
+                while process.poll() is None:
+                    yield
+                done = self._ended(step, digest, int(process.returncode))
+            self.done[step.key] = done
+            if not done.ok:
+                return
+
+    def _started(self, step: Step, place: str) -> subprocess.Popen[Any]:
+        """Start the program of a step."""
         from ..io.access import make_folder
 
-        while chain:
-            step = chain.popleft()
-            digest = digest_of(step)
-            earlier = self._kept(step, digest)
-            if earlier is not None:
-                self.done[step.key] = earlier
-                continue
-            folder = step.out.parent
-            make_folder(folder)
-            print_status(f'{step.key} ({place})')
-            with open(folder / LOG, 'a', encoding='utf-8') as log:
-                log.write(f'{PROMPT}{shlex.join(("fluoro-calib", *step.words))}\n')
-            process = self._programs.run(
-                'fluoro_calib_ros.cli',
-                *step.words,
-                '--json',
-                log=folder / LOG,
-                out=step.document,
-            )
-            return _Started(step, digest, process)
-        return None
+        folder = step.out.parent
+        make_folder(folder)
+        print_status(f'{step.key} ({place})')
+        with open(folder / LOG, 'a', encoding='utf-8') as log:
+            log.write(f'{PROMPT}{shlex.join(("fluoro-calib", *step.words))}\n')
+        command = 'fluoro_calib_ros.cli', *step.words, '--json'
+        return self._programs.run(*command, log=folder / LOG, out=step.document)
 
     def _kept(self, step: Step, digest: str) -> Done | None:
         """Return the earlier result of a step with the same options, inputs and program."""
@@ -349,20 +332,18 @@ class _Work:
             return None
         return Done(int(entry['status']), read_json(step.document))
 
-    def _ended(self, started: _Started) -> Done:
+    def _ended(self, step: Step, digest: str, status: int) -> Done:
         """Record the end of a step; return its result."""
         from ..io.documents import read_json, write_json
 
-        step = started.step
-        done = Done(int(started.process.returncode), {})
+        done = Done(status, {})
         if done.ok:
             done = replace(done, document=read_json(step.document))
-            self._state[step.key] = {'digest': started.digest, 'status': done.status}
+            self._state[step.key] = {'digest': digest, 'status': status}
         else:
             done = replace(done, message=_last_line(step.out.parent / LOG))
             self._state.pop(step.key, None)
             print_status(f'{step.key}: {done.message}')
-        self.done[step.key] = done
         write_json(self._out / STATE, self._state)
         return done
 

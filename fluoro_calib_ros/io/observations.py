@@ -91,17 +91,20 @@ def read_observations_csv(
 
 def read_named_observations(
     path: PathLike, image_size: Callable[[str], tuple[int, int]], known: Names
-) -> tuple[dict[str, list[Frame]], Names, str]:
+) -> tuple[dict[str, list[Frame]], Names, str, dict[str, str]]:
     """Read the frames of a CSV file in which fluoroscopes, exposures and targets may have names.
 
     image_size: returns width and height [px] for the id of a fluoroscope, or raises DataError.
     known: names whose ids are already known. Returns the frames by fluoroscope id, the names of
-    the file, and a sentence about excluded points off the image ('' if there are none). Raises
-    DataError as `read_observations_csv` does, and if more than a few points are off the image.
+    the file, a sentence about excluded points off the image ('' if there are none), and by
+    fluoroscope the id of the calibration that corrected its points (empty for observed points).
+    Raises DataError as `read_observations_csv` does, and if more than a few points are off the
+    image.
     """
     columns = _Columns(known)
     frames, stray = _read(path, image_size, columns)
-    return frames, columns.names(), stray
+    corrected_by = {name: identity for name, identity in columns.corrected_by.items() if identity}
+    return frames, columns.names(), stray, corrected_by
 
 
 class _Columns:
@@ -109,6 +112,7 @@ class _Columns:
 
     def __init__(self, known: Names | None) -> None:
         self.codes: dict[str, int] = {}
+        self.corrected_by: dict[str, str] = {}
         self.known = known
         self.exposure = NamedColumn('exposure', None if known is None else known.exposures)
         self.target = NamedColumn('target_id', None if known is None else known.targets)
@@ -244,19 +248,6 @@ def _rows_of(
         yield [name, exposures.get(number, number), *cells]
 
 
-def corrections_of(path: PathLike) -> dict[str, str]:
-    """Return the ids of the calibrations that corrected the points of a CSV file, by fluoroscope.
-
-    Returns {} for observed, uncorrected points. Raises DataError.
-    """
-    corrections: dict[str, str] = {}
-    for block in read_blocks(path, COLUMNS):
-        if CORRECTED_BY not in block:
-            return {}
-        corrections |= dict(zip(block.strings('fluoroscope'), block.strings(CORRECTED_BY)))
-    return {name: identity for name, identity in corrections.items() if identity}
-
-
 def _parse(block: Block, columns: _Columns) -> _Rows:
     """Return a block of the file as arrays; add new names to columns."""
     names = block.strings('fluoroscope')
@@ -266,6 +257,8 @@ def _parse(block: Block, columns: _Columns) -> _Rows:
             if columns.known is None or not name:
                 check_safe_name(name, f'{block.path}, row {block.lines[names.index(name)]}')
             codes[name] = len(codes)
+    if CORRECTED_BY in block:
+        columns.corrected_by |= zip(names, block.strings(CORRECTED_BY))
     uv = np.column_stack([block.floats(name, NOT_SEEN) for name in 'uv'])
     unknown = np.full(len(uv), np.nan)
     return _Rows(

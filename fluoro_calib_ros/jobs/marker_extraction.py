@@ -10,10 +10,12 @@ an earlier doubt are applied to the earlier images.
 
 from __future__ import annotations
 
+import heapq
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import groupby, repeat
 from pathlib import Path
 
 import numpy as np
@@ -426,19 +428,14 @@ def _angles_of(images: Mapping[str, SourceImage]) -> dict[str, float | None]:
 
 def _exposures(sources: Mapping[str, ImageSources]) -> Iterator[dict[str, SourceImage]]:
     """Yield the images of each exposure, by fluoroscope, ordered by exposure."""
-    readers = {name: _ahead(source.images()) for name, source in sources.items()}
-    waiting = {name: next(reader, None) for name, reader in readers.items()}
-    while True:
-        next_images = {name: image for name, image in waiting.items() if image is not None}
-        if not next_images:
-            return
-        exposure = min(image.exposure for image in next_images.values())
-        exposure_images = {
-            name: image for name, image in next_images.items() if image.exposure == exposure
-        }
-        yield exposure_images
-        for name in exposure_images:
-            waiting[name] = next(readers[name], None)
+    readers = [zip(repeat(name), _ahead(source.images())) for name, source in sources.items()]
+    merged = heapq.merge(*readers, key=_exposure)
+    for _, images in groupby(merged, key=_exposure):
+        yield dict(images)
+
+
+def _exposure(named: tuple[str, SourceImage]) -> int:
+    return named[1].exposure
 
 
 def _ahead(images: Iterator[SourceImage]) -> Iterator[SourceImage]:

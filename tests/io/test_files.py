@@ -380,7 +380,7 @@ def test_whole_numbers_that_are_written_as_floats_are_read(tmp_path, known):
     if known is None:
         frames = read_observations_csv(path, SIZE)
     else:
-        frames, names, _ = read_named_observations(path, lambda _: SIZE, known)
+        frames, names, *_ = read_named_observations(path, lambda _: SIZE, known)
         assert not names
     assert [(f.number, f.target_id.tolist()) for f in frames['a']] == [(1, [7]), (10, [7])]
 
@@ -430,7 +430,7 @@ def test_up_to_a_twentieth_of_the_points_may_be_off_the_image(tmp_path, off):
     if off == 6:
         assert 'row 22: ' in message_of(read_named_observations, path, lambda _: SIZE, Names())
         return
-    frames, _, said = read_named_observations(path, lambda _: SIZE, Names())
+    frames, _, said, _ = read_named_observations(path, lambda _: SIZE, Names())
     left = np.concatenate([frame.target_id for frame in frames['a']])
     assert left.tolist() == [i % 50 for i in range(100) if not 20 <= i < 20 + off]
     assert ('row 22: ' in said, ', and 4 more' in said) == (off > 0, off == 5)

@@ -193,13 +193,10 @@ class Recording:
                     items[number] = None  # type: ignore[call-overload]  # frees its memory
                     flushed = self._flush_if_due(flushed)
                 flushed = self._flush_if_due(flushed)
-            except DataError as error:
-                self._fail(str(error), [item for item in items if item is not None])
             except Exception as error:  # a bug must not end the recording silently
-                self._fail(
-                    f'{self.path}: the recording failed unexpectedly: {error!r}',
-                    [item for item in items if item is not None],
-                )
+                fault = f'{self.path}: the recording failed unexpectedly: {error!r}'
+                fault = str(error) if isinstance(error, DataError) else fault
+                self._fail(fault, [item for item in items if item is not None])
 
     @property
     def _period_s(self) -> float:

@@ -18,6 +18,7 @@ import sys
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import NamedTuple
@@ -298,12 +299,9 @@ def _chunk_at(data: mmap.mmap, position: int) -> tuple[bytes, int] | None:
 
 def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | None:
     """Return the content of a chunk, None if it cannot be decompressed."""
-    try:
+    with suppress(DataError), data:
         return decompressed(compression.decode(errors='replace'), data, size) or None
-    except DataError:
-        return None
-    finally:
-        data.release()
+    return None
 
 
 def _is_whole(content: bytes) -> bool:

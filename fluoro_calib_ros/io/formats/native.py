@@ -30,7 +30,7 @@ from ..bodies import POINT_COLUMNS as POINTS
 from ..csv_table import Table, has_columns, read_all
 from ..documents import are_numbers, read_yaml
 from ..observations import COLUMNS as OBSERVATIONS
-from ..observations import corrections_of, read_named_observations, write_observations_csv
+from ..observations import read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
 from ..phantom import read_named_phantom, write_phantom
 from .content import (
@@ -56,14 +56,14 @@ def _write_bag(path: Path, content: Content, settings: FileSettings) -> Written:
 
 
 def _read_observations(path: Path, settings: FileSettings) -> Content:
-    frames, names, stray = read_named_observations(
+    frames, names, stray, corrected_by = read_named_observations(
         path, lambda name: settings.image_size_of(path, name), settings.names
     )
     return Content(
         observations=frames,
         names=names,
         notes=(stray,) if stray else (),
-        corrected_by=corrections_of(path),
+        corrected_by=corrected_by,
     )
 
 

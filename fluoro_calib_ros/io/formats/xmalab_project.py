@@ -35,13 +35,13 @@ from ..access import os_errors
 from ..documents import parse_xml
 from .content import Camera, Content, FileSettings, Format, Station, check_matrix, check_rotation
 from .phantoms import content_of
-from .tables import Row, default_name, frame_of, named_targets, table_of
+from .tables import default_name, frame_of, named_targets, require_width, table_of
 
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read the wanted parts of a project. Raises DataError."""
-    with ProjectArchive(path) as archive:
-        return _content(_Project(archive, settings), settings)
+    with _Project(path, settings) as project:
+        return _content(project, settings)
 
 
 def _content(project: _Project, settings: FileSettings) -> Content:
@@ -78,23 +78,98 @@ def _is_set(element: ElementTree.Element, name: str = 'isCalibrated') -> bool:
     return value.isdigit() and int(value) > 0
 
 
-class _Project:
-    """Cameras, images and trials of an open project, with fluoroscope ids for the camera names."""
+DOCUMENT = 'project.xml'
 
-    def __init__(self, archive: ProjectArchive, settings: FileSettings) -> None:
-        self.archive = archive
-        self.path = archive.path
+
+class _Project:
+    """An open project, as a context manager, with fluoroscope ids for the camera names.
+
+    root is the root element of project.xml. The constructor raises DataError if the file is not a
+    project; the methods raise it for anything missing or damaged.
+    """
+
+    def __init__(self, path: Path, settings: FileSettings) -> None:
+        self.path = path
+        try:
+            with os_errors(path, 'cannot be read'):
+                self._archive = zipfile.ZipFile(path)
+        except zipfile.BadZipFile:
+            raise DataError(
+                f'{path}: this is not an XMALab project, which is a ZIP file'
+            ) from None
+        self._members = {
+            posixpath.normpath(info.filename.replace('\\', '/')): info
+            for info in self._archive.infolist()
+        }
+        self.root = self._document()
         self.settings = settings
-        self.cameras = archive.root.findall('Camera')
+        self.cameras = self.root.findall('Camera')
         if not self.cameras:
-            raise DataError(f'{archive.path}, {DOCUMENT}: the project has no cameras')
-        self._names = [archive.text(camera, 'Name') for camera in self.cameras]
+            raise DataError(f'{path}, {DOCUMENT}: the project has no cameras')
+        self._names = [self.text(camera, 'Name') for camera in self.cameras]
         known_names = settings.names.fluoroscopes
         if len(settings.fluoroscopes) == len(self.cameras) and not set(
             settings.fluoroscopes
         ) & set(self._names):
             known_names = dict(zip(self._names, settings.fluoroscopes))
         self.ids = safe_names(self._names, known_names)
+
+    def __enter__(self) -> _Project:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._archive.close()
+
+    def _document(self) -> ElementTree.Element:
+        root = parse_xml(self.member_text(DOCUMENT), f'{self.path}, {DOCUMENT}')
+        if root.tag != 'Project':
+            raise DataError(f'{self.path}, {DOCUMENT}: this is not a project of XMALab')
+        return root
+
+    def member(self, name: str, most: int = sys.maxsize) -> bytes:
+        """Return a file of the archive; it may have at most `most` bytes."""
+        info = self._members.get(posixpath.normpath(name.replace('\\', '/')))
+        if info is None:
+            raise DataError(f'{self.path}: the project does not contain {name}')
+        if info.file_size > min(most, read_limits().max_file_bytes):
+            raise DataError(f'{self.path}: {name} is too large, {info.file_size} bytes')
+        try:
+            return self._archive.read(info)
+        except Exception as error:  # zipfile and its decompressors raise various exceptions
+            raise DataError(f'{self.path}: {name} is damaged ({error})') from None
+
+    def member_text(self, name: str) -> str:
+        """Return a file of the archive as text."""
+        return self.member(name, MAX_MEMBER).decode('utf-8', 'replace')
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        """Return a table of numbers. Rows of different lengths are an error, too."""
+        rows = table_of(f'{self.path}, {name}', self.member_text(name))
+        require_width(rows, len(rows[0].cells), 'the first row')
+        return np.array([row.numbers_or_nan() for row in rows])
+
+    def text(self, element: ElementTree.Element, name: str) -> str:
+        """Return an attribute of an element."""
+        value = element.get(name)
+        if value is None:
+            raise DataError(f'{self.path}, {DOCUMENT}: a {element.tag} has no attribute {name}')
+        return value
+
+    def whole(self, element: ElementTree.Element, name: str) -> int:
+        """Return an attribute that is a non-negative integer."""
+        text = self.text(element, name)
+        if not text.isascii() or not text.isdigit():
+            raise DataError(
+                f'{self.path}, {DOCUMENT}: {name} of a {element.tag} is {text!r}, not an integer'
+            )
+        return int(text)
+
+    def file_of(self, element: ElementTree.Element, tag: str) -> str:
+        """Return the file name of a child element."""
+        child = element.find(tag)
+        if child is None:
+            raise DataError(f'{self.path}, {DOCUMENT}: a {element.tag} has no {tag}')
+        return self.text(child, 'Filename')
 
     def named(self) -> Iterator[tuple[ElementTree.Element, str]]:
         """Yield the cameras with their fluoroscope ids."""
@@ -103,34 +178,32 @@ class _Project:
 
     def survey(self) -> Content:
         """Return the frame specification; an empty Content without one, as for a checkerboard."""
-        element = self.archive.root.find('CalibrationObject')
+        element = self.root.find('CalibrationObject')
         name = '' if element is None else element.get('FrameSpecifications', '')
         if not name:
             return Content()
-        return content_of(
-            Path(f'{self.path}, {name}'), self.archive.member_text(name), self.settings
-        )
+        return content_of(Path(f'{self.path}, {name}'), self.member_text(name), self.settings)
 
     def images(self, camera: ElementTree.Element) -> Iterator[tuple[int, ElementTree.Element]]:
         """Yield the calibration images of a camera with their exposure numbers."""
         for number, image in enumerate(camera.findall('CalibrationImage'), 1):
-            yield (self.archive.whole(image, 'Frame') + 1 if image.get('Frame') else number), image
+            yield (self.whole(image, 'Frame') + 1 if image.get('Frame') else number), image
 
     def image_size(self, camera: ElementTree.Element) -> tuple[int, int]:
         """Return the image size of a camera from its sequence, images or the settings."""
         sequence = camera.find('CalibrationSequence')
         if sequence is not None:
-            return self.archive.whole(sequence, 'Width'), self.archive.whole(sequence, 'Height')
+            return self.whole(sequence, 'Width'), self.whole(sequence, 'Height')
         for image in camera.findall('CalibrationImage'):
             if image.get('Width'):
-                return self.archive.whole(image, 'Width'), self.archive.whole(image, 'Height')
-            name = self.archive.text(image, 'Filename')
-            size = declared_size(memoryview(self.archive.member(name)))
+                return self.whole(image, 'Width'), self.whole(image, 'Height')
+            name = self.text(image, 'Filename')
+            size = declared_size(memoryview(self.member(name)))
             with ErrorsAt(f'{self.path}: {name}'):
                 check_size(*size)
             if min(size) > 0:
                 return size
-        name = self.archive.text(camera, 'Name')
+        name = self.text(camera, 'Name')
         given = self.settings.size_of(self.ids[name])
         if given is None:
             raise DataError(
@@ -141,7 +214,7 @@ class _Project:
 
     def trial(self) -> ElementTree.Element:
         """Return the chosen trial. Raises DataError."""
-        trials = {trial.get('Name', ''): trial for trial in self.archive.root.findall('Trial')}
+        trials = {trial.get('Name', ''): trial for trial in self.root.findall('Trial')}
         try:
             return trials[self.settings.trial or '']
         except KeyError:
@@ -177,10 +250,9 @@ def _points_of_image(
     project: _Project, survey: Content, image: ElementTree.Element
 ) -> tuple[str, NDArray[np.int64], NDArray[np.float64]]:
     """Return place, ids (n,) and points (n, 2) of a calibration image that XMALab used."""
-    files = project.archive
-    file = files.file_of(image, 'PointsDetected')
-    uv = files.numbers(file)
-    inlier = files.numbers(files.file_of(image, 'Inlier'))
+    file = project.file_of(image, 'PointsDetected')
+    uv = project.numbers(file)
+    inlier = project.numbers(project.file_of(image, 'Inlier'))
     count = len(uv) if survey.survey is None else len(survey.survey.target_id)
     if uv.shape[1:] != (2,) or len(uv) != count or inlier.shape != (count, 1):
         raise DataError(
@@ -197,14 +269,13 @@ def _trial_frames(
     project: _Project, survey: Content
 ) -> tuple[dict[str, list[Frame]], dict[str, int]]:
     """Return the frames of the markers of a trial, and the ids of the markers by name."""
-    files = project.archive
     trial = project.trial()
     where = f'{project.path}, trial {project.settings.trial}'
     markers = trial.findall('Marker')
     if not markers:
         raise DataError(f'{project.path}: the trial {project.settings.trial!r} has no markers')
     labels = [
-        marker.get('Description') or default_name(files.whole(marker, 'ID') + 1)
+        marker.get('Description') or default_name(project.whole(marker, 'ID') + 1)
         for marker in markers
     ]
     ids = number_names(labels, project.settings.names.targets or survey.names.targets)
@@ -231,13 +302,12 @@ def _trial_frames(
 
 def _points_of_marker(project: _Project, marker: ElementTree.Element) -> NDArray[np.float64]:
     """Return the points of a marker by frame and camera (m, c, 2), NaN where not seen."""
-    files = project.archive
     count = len(project.cameras)
-    uv = files.numbers(files.text(marker, 'FilenamePoints2D'))
-    status = files.numbers(files.text(marker, 'FilenameStatus2D'))
+    uv = project.numbers(project.text(marker, 'FilenamePoints2D'))
+    status = project.numbers(project.text(marker, 'FilenameStatus2D'))
     if uv.shape != (len(status), 2 * count) or status.shape[1] != count:
         raise DataError(
-            f'{project.path}, {files.text(marker, "FilenamePoints2D")}: {uv.shape[1]} columns, '
+            f'{project.path}, {project.text(marker, "FilenamePoints2D")}: {uv.shape[1]} columns, '
             f'but there are {count} cameras'
         )
     return np.where((status > 0)[..., None], uv.reshape(len(uv), count, 2), np.nan)
@@ -245,14 +315,13 @@ def _points_of_marker(project: _Project, marker: ElementTree.Element) -> NDArray
 
 def _stations(project: _Project, mm: float) -> Iterator[Station]:
     """Yield the pose of every calibrated image."""
-    files = project.archive
     for camera, name in project.named():
         for number, image in project.images(camera):
             if not _is_set(image):
                 continue
-            file = files.file_of(image, 'RotationMatrix')
-            rotation = files.numbers(file)
-            translation = files.numbers(files.file_of(image, 'TranslationVector')).ravel()
+            file = project.file_of(image, 'RotationMatrix')
+            rotation = project.numbers(file)
+            translation = project.numbers(project.file_of(image, 'TranslationVector')).ravel()
             if rotation.shape != (3, 3) or translation.shape != (3,):
                 raise DataError(f'{project.path}, {file}: this is not a pose')
             check_rotation(f'{project.path}, {file}', rotation)
@@ -265,19 +334,18 @@ def _cameras(project: _Project, stations: tuple[Station, ...]) -> Iterator[Camer
     The poses are those of the reference image of the chosen trial, otherwise of the first image
     in which all cameras are calibrated.
     """
-    files = project.archive
     calibrated = [(camera, name) for camera, name in project.named() if _is_set(camera)]
     reference = _reference(project, stations, {name for _, name in calibrated})
     poses = {s.fluoroscope: s for s in reversed(stations) if s.exposure == reference}
     for camera, name in calibrated:
-        file = files.text(camera, 'CameraMatrix')
-        matrix = files.numbers(file)
+        file = project.text(camera, 'CameraMatrix')
+        matrix = project.numbers(file)
         if matrix.shape != (3, 3):
             raise DataError(f'{project.path}, {file}: this is not a camera matrix')
         check_matrix(f'{project.path}, {file}', matrix)
         distortion: tuple[float, ...] = ()
         if camera.get('UndistortionParameter'):
-            parameters = files.numbers(files.text(camera, 'UndistortionParameter'))
+            parameters = project.numbers(project.text(camera, 'UndistortionParameter'))
             distortion = tuple(parameters.ravel().tolist())
         size = project.image_size(camera)
         unposed = Camera(name, matrix, size, distortion=distortion)
@@ -294,7 +362,7 @@ def _reference(
 ) -> int | None:
     """Return the exposure from which the poses of the cameras are taken."""
     if project.settings.trial is not None:
-        return project.archive.whole(project.trial(), 'referenceCalibration') + 1
+        return project.whole(project.trial(), 'referenceCalibration') + 1
     by_exposure: dict[int, set[str]] = {}
     for station in stations:
         by_exposure.setdefault(station.exposure, set()).add(station.fluoroscope)
@@ -303,18 +371,17 @@ def _reference(
 
 def _grids(project: _Project) -> Iterator[tuple[str, NDArray[np.float64]]]:
     """Yield the grid points that XMALab used: observed u, v and reference u, v."""
-    files = project.archive
     for camera, name in project.named():
         grid = camera.find('UndistortionGrid')
         if grid is None or not _is_set(grid, 'isComputed'):
             continue
         observed, reference, inlier = (
-            files.numbers(files.file_of(grid, f'GridPoints{part}'))
+            project.numbers(project.file_of(grid, f'GridPoints{part}'))
             for part in ('Distorted', 'References', 'Inlier')
         )
         if not observed.shape == reference.shape == (len(inlier), 2):
             raise DataError(
-                f'{project.path}: the undistortion grid of {files.text(camera, "Name")} has '
+                f'{project.path}: the undistortion grid of {project.text(camera, "Name")} has '
                 f'{len(observed)}, {len(reference)} and {len(inlier)} points'
             )
         yield name, np.hstack([observed, reference])[inlier[:, 0] == 1]
@@ -329,91 +396,3 @@ FORMAT = Format(
     write=None,
     says_units=False,
 )
-
-
-# Access to the ZIP file of an XMALab project.
-
-DOCUMENT = 'project.xml'
-
-
-class ProjectArchive:
-    """An open project, as a context manager. root is the root element of project.xml.
-
-    The constructor raises DataError if the file is not a project; the methods raise it for
-    anything missing or damaged.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        try:
-            with os_errors(path, 'cannot be read'):
-                self._archive = zipfile.ZipFile(path)
-        except zipfile.BadZipFile:
-            raise DataError(
-                f'{path}: this is not an XMALab project, which is a ZIP file'
-            ) from None
-        self._members = {
-            posixpath.normpath(info.filename.replace('\\', '/')): info
-            for info in self._archive.infolist()
-        }
-        self.root = self._document()
-
-    def __enter__(self) -> ProjectArchive:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._archive.close()
-
-    def _document(self) -> ElementTree.Element:
-        root = parse_xml(self.member_text(DOCUMENT), f'{self.path}, {DOCUMENT}')
-        if root.tag != 'Project':
-            raise DataError(f'{self.path}, {DOCUMENT}: this is not a project of XMALab')
-        return root
-
-    def member(self, name: str, most: int = sys.maxsize) -> bytes:
-        """Return a file of the archive; it may have at most `most` bytes."""
-        info = self._members.get(posixpath.normpath(name.replace('\\', '/')))
-        if info is None:
-            raise DataError(f'{self.path}: the project does not contain {name}')
-        if info.file_size > min(most, read_limits().max_file_bytes):
-            raise DataError(f'{self.path}: {name} is too large, {info.file_size} bytes')
-        try:
-            return self._archive.read(info)
-        except Exception as error:  # zipfile and its decompressors raise various exceptions
-            raise DataError(f'{self.path}: {name} is damaged ({error})') from None
-
-    def member_text(self, name: str) -> str:
-        """Return a file of the archive as text."""
-        return self.member(name, MAX_MEMBER).decode('utf-8', 'replace')
-
-    def numbers(self, name: str) -> NDArray[np.float64]:
-        """Return a table of numbers. Rows of different lengths are an error, too."""
-        rows: list[Row] = table_of(f'{self.path}, {name}', self.member_text(name))
-        values = [row.numbers_or_nan() for row in rows]
-        for row, row_values in zip(rows, values):
-            if len(row_values) != len(values[0]):
-                row.fail(f'{len(row_values)} columns, but the first row has {len(values[0])}')
-        return np.array(values)
-
-    def text(self, element: ElementTree.Element, name: str) -> str:
-        """Return an attribute of an element."""
-        value = element.get(name)
-        if value is None:
-            raise DataError(f'{self.path}, {DOCUMENT}: a {element.tag} has no attribute {name}')
-        return value
-
-    def whole(self, element: ElementTree.Element, name: str) -> int:
-        """Return an attribute that is a non-negative integer."""
-        text = self.text(element, name)
-        if not text.isascii() or not text.isdigit():
-            raise DataError(
-                f'{self.path}, {DOCUMENT}: {name} of a {element.tag} is {text!r}, not an integer'
-            )
-        return int(text)
-
-    def file_of(self, element: ElementTree.Element, tag: str) -> str:
-        """Return the file name of a child element."""
-        child = element.find(tag)
-        if child is None:
-            raise DataError(f'{self.path}, {DOCUMENT}: a {element.tag} has no {tag}')
-        return self.text(child, 'Filename')

@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -177,30 +177,54 @@ def _indexed_messages(
         for number, channel in summary.channels.items()
         if topics is None or channel.topic in topics
     }
-    # Time, offset of the chunk, number in it (-1: the chunk itself), message
-    queue: list[tuple[int, int, int, Message | None]] = [
-        (index.message_start_time, index.chunk_start_offset, -1, None)
-        for index in summary.chunk_indexes
+    indexes = [
+        index
+        for index in sorted(summary.chunk_indexes, key=lambda i: i.chunk_start_offset)
         if not index.message_index_offsets or wanted & set(index.message_index_offsets)
     ]
-    heapq.heapify(queue)
-    while queue:
-        _, offset, _, message = heapq.heappop(queue)
-        if message is not None:
-            yield _message(summary, message)
-            continue
-        file.seek(offset)
+
+    def messages(number: int) -> Iterator[BagMessage]:
+        file.seek(indexes[number].chunk_start_offset)
         limits: dict[str, Any] = {'emit_chunks': True, 'record_size_limit': MAX_RECORD}
         chunk = next(StreamReader(file, skip_magic=True, **limits).records)
         if not isinstance(chunk, Chunk):
             raise DataError(f'{file.name}: the bag is damaged, its index names no chunk')
-        for number, record in enumerate(_broken_up(file.name, chunk)):
-            if isinstance(record, Message) and record.channel_id not in summary.channels:
-                raise DataError(
-                    f'{file.name}: the bag is damaged, the topic of messages is unknown'
-                )
-            if isinstance(record, Message) and record.channel_id in wanted:
-                heapq.heappush(queue, (record.log_time, offset, number, record))
+        records = [r for r in _broken_up(file.name, chunk) if isinstance(r, Message)]
+        if any(record.channel_id not in summary.channels for record in records):
+            raise DataError(f'{file.name}: the bag is damaged, the topic of messages is unknown')
+        records.sort(key=lambda record: record.log_time)
+        return iter([_message(summary, r) for r in records if r.channel_id in wanted])
+
+    yield from merged_by_time([index.message_start_time for index in indexes], messages)
+
+
+def merged_by_time(
+    starts_ns: Iterable[int], messages: Callable[[int], Iterator[BagMessage]]
+) -> Iterator[BagMessage]:
+    """Yield the messages of sources in the order of log time.
+
+    starts_ns: time of the first message of each source. messages: opens a source, given by its
+    number, once its first message is due: a recording may have more chunks than fit into memory,
+    and more files than a process may open.
+    """
+    streams: dict[int, Iterator[BagMessage]] = {}
+    # Next message of each source; None: it is not open
+    queue: list[tuple[int, int, BagMessage | None]] = [
+        (start_ns, number, None) for number, start_ns in enumerate(starts_ns)
+    ]
+    heapq.heapify(queue)
+    while queue:
+        _, number, message = queue[0]
+        if message is None:
+            streams[number] = messages(number)
+        else:
+            yield message
+        following = next(streams[number], None)
+        if following is None:
+            heapq.heappop(queue)
+            del streams[number]
+        else:
+            heapq.heapreplace(queue, (following.log_time_ns, number, following))
 
 
 def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Iterator[BagMessage]:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ from .mcap_file import (
     channels_of_bag,
     channels_of_file,
     is_foreign,
+    merged_by_time,
     messages_of_bag,
     messages_of_file,
     start_of_file,
@@ -188,36 +188,8 @@ def iterate_messages(
         yield from messages_of_bag(source, wanted)
         return
     paths = storage_files(source)
-    if len(paths) == 1:
-        yield from messages_of_file(paths[0], wanted)
-    else:
-        yield from _merged(paths, wanted)
-
-
-def _merged(paths: Sequence[str], topics: Collection[str] | None) -> Iterator[BagMessage]:
-    """Yield the messages of files in the order of log time.
-
-    A file is opened when its first message is due, as a split recording may have more files than
-    a process may open.
-    """
-    streams: dict[int, Iterator[BagMessage]] = {}
-    # Next message of each file; None: the file is not open
-    queue: list[tuple[int, int, BagMessage | None]] = [
-        (start_of_file(path), number, None) for number, path in enumerate(paths)
-    ]
-    heapq.heapify(queue)
-    while queue:
-        _, number, message = queue[0]
-        if message is None:
-            streams[number] = messages_of_file(paths[number], topics)
-        else:
-            yield message
-        following = next(streams[number], None)
-        if following is None:
-            heapq.heappop(queue)
-            del streams[number]
-        else:
-            heapq.heapreplace(queue, (following.log_time_ns, number, following))
+    starts_ns = [start_of_file(path) for path in paths]
+    yield from merged_by_time(starts_ns, lambda n: messages_of_file(paths[n], wanted))
 
 
 def topics_of(source: PathLike) -> dict[str, TopicInfo]:

@@ -34,7 +34,6 @@ from ..photogrammetry.network import Network, similarity_directions
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.outliers import FALSE_ALARM
 from ..photogrammetry.precision import covariance_times_points
-from ..photogrammetry.unknowns import UnknownVector
 from .beads import MIN_BEADS, SD_FACTOR
 from .calibration_evidence import Evidence, Subject
 from .check import Check
@@ -126,7 +125,7 @@ def _score(evidence: Evidence, solved: SolvedNetwork, displacement: NDArray[np.f
     matrix = factorize(network, equations)
     weighted = displacement / network.survey_sd_mm[:, None, None] ** 2
     followed = covariance_times_points(matrix, weighted).points
-    step = matrix.solve(UnknownVector(equations.e, equations.p, equations.g)).points[..., 0]
+    step = matrix.solve(equations.right).points
     misclosure = network.survey_mm - parameters.points_mm - step
     return _Score(
         np.einsum('nai,naj->ij', weighted, displacement - followed),

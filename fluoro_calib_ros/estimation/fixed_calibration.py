@@ -90,7 +90,7 @@ class SolvedNetwork:
                     *additional,
                 ]
             ),
-            self._as_stated(joint_covariance(blocks).matrix),
+            self._as_stated(joint_covariance(blocks)),
         )
 
     def covariance_of_points(

@@ -186,11 +186,7 @@ class _Problem:
     def step(self, solver: _Solver) -> _Step:
         """Return the step that solves the normal equations."""
         system = solver.system
-        x_blocks, x_rest = solver.factor.solve(
-            system.block_right[..., None], system.rest_right[:, None]
-        )
-        x_blocks = x_blocks[..., 0]
-        x_rest = x_rest[:, 0]
+        x_blocks, x_rest = solver.factor.solve(system.block_right, system.rest_right)
         predicted = system.predicted_decrease(x_blocks, x_rest, solver.mu)
         return _Step(x_blocks, x_rest, predicted)
 

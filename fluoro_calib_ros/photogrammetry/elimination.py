@@ -96,12 +96,15 @@ class BorderedFactor:
     def solve(
         self, block_right: NDArray[np.float64], rest_right: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return x_b (k, s, d) and x_r (q, d) for right sides (k, s, d) and (q, d)."""
-        columns = block_right.shape[2]
-        half = (self.inverse @ block_right).reshape(-1, columns)
-        x_remaining = cho_solve((self.schur, True), rest_right - self.half_border.T @ half)
-        remaining = (half - self.half_border @ x_remaining).reshape(block_right.shape)
-        return self.inverse.transpose(0, 2, 1) @ remaining, x_remaining
+        """Return x_b (k, s, ...) and x_r (q, ...) for right sides (k, s, ...) and (q, ...)."""
+        columns = int(np.prod(block_right.shape[2:]))
+        shape = (*self.inverse.shape[:2], columns)
+        half = (self.inverse @ block_right.reshape(shape)).reshape(-1, columns)
+        right = rest_right.reshape(-1, columns) - self.half_border.T @ half
+        x_remaining = cho_solve((self.schur, True), right)
+        remaining = (half - self.half_border @ x_remaining).reshape(shape)
+        x_blocks = self.inverse.transpose(0, 2, 1) @ remaining
+        return x_blocks.reshape(block_right.shape), x_remaining.reshape(rest_right.shape)
 
     def covariance(self) -> BorderedCovariance:
         """Return the blocks of the inverse of the matrix."""
@@ -169,7 +172,7 @@ class Elimination(ABC):
 
     @abstractmethod
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return right sides (k, s) of the eliminated and (q,) of the remaining unknowns."""
+        """Return right sides (k, s, ...) of eliminated and (q, ...) of remaining unknowns."""
 
     @abstractmethod
     def to_unknowns(
@@ -178,14 +181,15 @@ class Elimination(ABC):
         """Return eliminated (k, s, ...) and remaining (q, ...) unknowns by kind."""
 
     @abstractmethod
-    def right_side_of_points(
-        self, values: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return right sides (k, s, d) and (q, d): values (n, 3, d) for points, else zeros."""
-
-    @abstractmethod
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Return covariances by kind of unknown."""
+
+    def _remaining_right(
+        self, of_blocks: NDArray[np.float64], right: UnknownVector
+    ) -> NDArray[np.float64]:
+        """Return the right side (q, ...) of remaining blocks (c, s, ...) and free globals."""
+        blocks = of_blocks.reshape(-1, *of_blocks.shape[2:])
+        return np.concatenate([blocks, right.globals[self.network.layout.free]])
 
     def _globals_of(self, x_remaining: NDArray[np.float64]) -> NDArray[np.float64]:
         return self.network.layout.expand_globals(x_remaining[self.layout.globals])
@@ -269,13 +273,13 @@ class EliminatePoints(Elimination):
         remaining[rows[b][:, :, None], rows[a][:, None, :]] = equations.coupled.transpose(0, 2, 1)
         if equations.gauge is not None:
             self._fix_gauge(remaining, equations.gauge.exteriors)
-        right = self.right_sides(UnknownVector(equations.e, equations.p, equations.g))
-        return BorderedSystem(equations.pp, border, remaining, *right)
+        return BorderedSystem(
+            equations.pp, border, remaining, *self.right_sides(equations.right)
+        )
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return right sides of points (n, 3), and of exposures and free globals (q,)."""
-        free = self.network.layout.free
-        return right.points, np.concatenate([right.exteriors.ravel(), right.globals[free]])
+        """Return right sides of points (n, 3, ...), and of exposures and free globals (q, ...)."""
+        return right.points, self._remaining_right(right.exteriors, right)
 
     def to_unknowns(
         self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
@@ -283,12 +287,6 @@ class EliminatePoints(Elimination):
         """Return object points (n, 3, ...) and remaining unknowns (q, ...) by kind."""
         exteriors = x_remaining[self.layout.blocks].reshape(-1, POSE_SIZE, *x_remaining.shape[1:])
         return UnknownVector(exteriors, x_blocks, self._globals_of(x_remaining))
-
-    def right_side_of_points(
-        self, values: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the values themselves, and zeros for the remaining unknowns."""
-        return values, np.zeros((self.layout.size, values.shape[2]))
 
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Return covariances of points from the blocks, of exposures from the remaining part."""
@@ -345,18 +343,20 @@ class EliminateExposures(Elimination):
         remaining = self._remaining_matrix(equations.pp, equations.pg, equations)
         if equations.gauge is not None:
             self._fix_gauge(remaining, equations.gauge.points)
-        right = self.right_sides(UnknownVector(equations.e, equations.p, equations.g))
         return BorderedSystem(
-            self._cell_blocks(equations), self._cell_border(equations), remaining, *right
+            self._cell_blocks(equations),
+            self._cell_border(equations),
+            remaining,
+            *self.right_sides(equations.right),
         )
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return right sides of cells (k, s), and of points and free globals (q,)."""
-        cell_right = np.zeros((self.n_cells, self.n_places, POSE_SIZE))
+        """Return right sides of cells (k, s, ...), and of points and free globals (q, ...)."""
+        columns = right.exteriors.shape[2:]
+        cell_right = np.zeros((self.n_cells, self.n_places, POSE_SIZE, *columns))
         cell_right[self.cell, self.place] = right.exteriors
-        free = self.network.layout.free
-        remaining = np.concatenate([right.points.ravel(), right.globals[free]])
-        return cell_right.reshape(self.n_cells, -1), remaining
+        cell_right = cell_right.reshape(self.n_cells, -1, *columns)
+        return cell_right, self._remaining_right(right.points, right)
 
     def _cell_blocks(self, equations: NormalEquations) -> NDArray[np.float64]:
         """Return blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
@@ -392,15 +392,6 @@ class EliminateExposures(Elimination):
         """Return cells (k, s, ...) and remaining unknowns (q, ...) by kind."""
         points = x_remaining[self.layout.blocks].reshape(-1, POINT_SIZE, *x_remaining.shape[1:])
         return UnknownVector(self._of_exposures(x_blocks), points, self._globals_of(x_remaining))
-
-    def right_side_of_points(
-        self, values: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return zeros for the cells, and the values in the rows of the object points."""
-        columns = values.shape[2]
-        remaining = np.zeros((self.layout.size, columns))
-        remaining[self.layout.blocks] = values.reshape(-1, columns)
-        return np.zeros((self.n_cells, POSE_SIZE * self.n_places, columns)), remaining
 
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Return covariances of exposures from the cells, of points from the remaining part."""
@@ -467,10 +458,13 @@ class FactorizedNormalMatrix:
         return self.elimination.network
 
     def solve(self, right: UnknownVector) -> UnknownVector:
-        """Solve the normal equations for a right side; returns (..., 1)."""
-        block_right, rest_right = self.elimination.right_sides(right)
-        solution = self.factor.solve(block_right[..., None], rest_right[:, None])
-        return self.elimination.to_unknowns(*solution)
+        """Solve the normal equations for a right side, or for columns of right sides.
+
+        For a free network, other directions are fixed than in its datum.
+        """
+        return self.elimination.to_unknowns(
+            *self.factor.solve(*self.elimination.right_sides(right))
+        )
 
 
 def factorize(

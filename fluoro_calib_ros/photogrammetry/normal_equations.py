@@ -35,7 +35,7 @@ MIN_WEIGHT = 1e-8
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Blocks of the normal matrix and of its right side.
+    """Blocks of the normal matrix, and its right side.
 
     e stands for exposures, p for object points and g for the global unknowns (see unknowns).
     """
@@ -47,9 +47,7 @@ class NormalEquations:
     pg: NDArray[np.float64]  #: (n, 3, G)
     #: (N, 3, 6) mixed block of object point and exposure of each image point
     pe: NDArray[np.float64]
-    e: NDArray[np.float64]  #: (m, 6) right sides
-    p: NDArray[np.float64]  #: (n, 3)
-    g: NDArray[np.float64]  #: (G,)
+    right: UnknownVector
     coupled_pairs: NDArray[np.int64]  #: (k, 2) exposures coupled by a relative orientation
     coupled: NDArray[np.float64]  #: (k, 6, 6) their mixed blocks
     gauge: Gauge | None = None  #: directions that a free network leaves open
@@ -312,9 +310,7 @@ def normal_equations(
         eg=blocks.eg,
         pg=blocks.pg,
         pe=sums.pe,
-        e=e,
-        p=p,
-        g=blocks.g,
+        right=UnknownVector(e, p, blocks.g),
         coupled_pairs=coupled_pairs,
         coupled=coupled,
         gauge=open_gauge(network, parameters),

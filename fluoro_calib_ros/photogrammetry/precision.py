@@ -22,7 +22,7 @@ from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, 
 from .network import Gauge, Network, STransformation
 from .noise import Noise
 from .normal_equations import CHUNK, MIN_WEIGHT, NormalEquations, normal_equations, right_sides
-from .unknowns import Parameters, UnknownVector, discrepancies_with_jacobian
+from .unknowns import POSE_SIZE, Parameters, UnknownVector, discrepancies_with_jacobian
 
 # Largest number of object points whose joint covariance is stored. The more there are, the less it
 # matters: their common part is the datum.
@@ -95,9 +95,10 @@ def covariance_times_points(
 
     For a free network, the inverse is the one with other directions fixed than in its datum.
     """
-    elimination = matrix.elimination
-    solution = matrix.factor.solve(*elimination.right_side_of_points(values))
-    return elimination.to_unknowns(*solution)
+    layout = matrix.network.layout
+    columns = values.shape[2]
+    exteriors = np.zeros((layout.n_exposures, POSE_SIZE, columns))
+    return matrix.solve(UnknownVector(exteriors, values, np.zeros((layout.n_globals, columns))))
 
 
 def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> NDArray[np.float64]:
@@ -136,11 +137,10 @@ def solved_additional(
     """
     parameters = adjustment.parameters
     if network.relative:
-        equations = normal_equations(network, parameters, 0.0, adjustment.noise)
-        right = UnknownVector(equations.e, equations.p, equations.g)
+        right = normal_equations(network, parameters, 0.0, adjustment.noise).right
     else:
         right = right_sides(network, parameters, 0.0, adjustment.noise)
-    step = matrix.solve(right).globals[:, 0]
+    step = matrix.solve(right).globals
     return tuple(
         coefficients + step[columns]
         for coefficients, columns in zip(parameters.additional, network.layout.additional)
@@ -298,47 +298,28 @@ def _covariances(network: Network, blocks: CovarianceBlocks) -> dict[str, Any]:
         'points': blocks.pp,
         'all_global': blocks.gg,
         'exterior_global': blocks.eg,
-        'joint_points': joint_covariance(blocks).points if few_points else None,
+        'joint_points': covariance_of_points(blocks) if few_points else None,
     }
 
 
-@dataclass(frozen=True)
-class JointCovariance:
-    """Joint covariances of all unknowns."""
-
-    exteriors: NDArray[np.float64]  #: (6m, 6m)
-    points: NDArray[np.float64]  #: (3n, 3n)
-    points_exteriors: NDArray[np.float64]  #: (3n, 6m)
-    #: (3n, G)
-    globals: NDArray[np.float64]
-    exteriors_globals: NDArray[np.float64]
-    points_globals: NDArray[np.float64]
-
-    @property
-    def matrix(self) -> NDArray[np.float64]:
-        """Joint matrix of exposures, object points and global unknowns."""
-        return np.block(
-            [
-                [self.exteriors, self.points_exteriors.T, self.exteriors_globals],
-                [self.points_exteriors, self.points, self.points_globals],
-                [self.exteriors_globals.T, self.points_globals.T, self.globals],
-            ]
-        )
-
-
-def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
-    """Return joint covariances of all unknowns from blocks of an inverse normal matrix."""
-    m = len(blocks.ee)
-    n = len(blocks.pp)
+def joint_covariance(blocks: CovarianceBlocks) -> NDArray[np.float64]:
+    """Return the covariance of exposures, object points and global unknowns from its blocks."""
     size = len(blocks.gg)
-    return JointCovariance(
-        covariance_of_exteriors(blocks),
-        _assembled(blocks.points_between, n, n),
-        points_exteriors=_assembled(lambda p, e: blocks.pe(e, p), n, m),
-        globals=blocks.gg,
-        exteriors_globals=blocks.eg.reshape(-1, size),
-        points_globals=blocks.pg.reshape(-1, size),
+    exteriors_globals = blocks.eg.reshape(-1, size)
+    points_globals = blocks.pg.reshape(-1, size)
+    mixed = _assembled(lambda p, e: blocks.pe(e, p), len(blocks.pp), len(blocks.ee))
+    return np.block(
+        [
+            [covariance_of_exteriors(blocks), mixed.T, exteriors_globals],
+            [mixed, covariance_of_points(blocks), points_globals],
+            [exteriors_globals.T, points_globals.T, blocks.gg],
+        ]
     )
+
+
+def covariance_of_points(blocks: CovarianceBlocks) -> NDArray[np.float64]:
+    """Return the joint covariance (3n, 3n) of the object points."""
+    return _assembled(blocks.points_between, len(blocks.pp), len(blocks.pp))
 
 
 def covariance_of_exteriors(blocks: CovarianceBlocks) -> NDArray[np.float64]:

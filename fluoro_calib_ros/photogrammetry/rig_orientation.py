@@ -307,17 +307,12 @@ def _check_orientation(
     names: Sequence[str], interior: NDArray[np.float64], rotation: np.ndarray
 ) -> None:
     """Raise DataError for a negative principal distance or an invalid rotation matrix."""
-    is_invalid = (np.abs(rotation) > 1 + ROUNDING).any(axis=(1, 2))
-    rotation = np.where(is_invalid[:, None, None], 0.0, rotation)  # avoid overflow; refused below
-    product = rotation @ rotation.transpose(0, 2, 1)
-    errors = np.max(np.abs(product - np.eye(3)), axis=(1, 2))
-    signs = np.linalg.det(rotation)
-    for name, (_, _, c), error, sign in zip(names, interior, errors, signs):
+    for name, (_, _, c), is_valid in zip(names, interior, is_rotation(rotation, ROUNDING)):
         if c <= 0:
             raise DataError(
                 f'rig orientation: the principal distance of fluoroscope {name} is {c:g} px'
             )
-        if error > ROUNDING or sign < 0:
+        if not is_valid:
             raise DataError(
                 f'rig orientation: the rotation of fluoroscope {name} is not a rotation matrix'
             )

@@ -695,9 +695,9 @@ def test_right_sides_alone_equal_those_of_the_normal_equations(kind, prior):
     equations = normal_equations(network, at, correction, noise)
     found = right_sides(network, at, correction, noise)
     for one, other in (
-        (found.exteriors, equations.e),
-        (found.points, equations.p),
-        (found.globals, equations.g),
+        (found.exteriors, equations.right.exteriors),
+        (found.points, equations.right.points),
+        (found.globals, equations.right.globals),
     ):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 

@@ -153,7 +153,7 @@ class Regressions:
         """Return the models of values (N, 2) by fluoroscope, with terms of the last adjustment."""
         out = {}
         for f, (name, rows) in enumerate(self._rows.items()):
-            series = None if terms is None else terms.fitted_series(f, after, precise)
+            series = None if terms is None else terms.parts[f].fitted_series(after, precise)
             out[name] = self.steps[name].model(values[rows], series)
         return out
 
@@ -250,7 +250,7 @@ def calibrate_by_regression(
     after = before
     if terms is not None:
         network = terms.with_additional(network)
-        after = with_additional(before, terms.zeros())
+        after = with_additional(before, terms.start())
     history = History(measured, progress)
     rounds = _Alternation(network, after, regressions, history)
     converged = False

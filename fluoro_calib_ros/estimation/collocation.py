@@ -26,19 +26,17 @@ priors stay fixed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.angle_field import AngleField
-from ..correction.series import Functions, Series
+from ..correction.series import Series
 from ..photogrammetry.precision import solved_additional
 from .estimator import AdjustedTerms, AdjustmentProblem, coefficients_of
-from .exposure_terms import ExposureTerms, estimates_beside_free_points
+from .exposure_terms import estimates_beside_free_points
 from .fluoroscope_terms import FluoroscopeTerms
-from .lack_of_fit import LeftOut
 from .priors import Prior, SeriesEquations, most_likely_prior
 from .refinements import (
     SETTLED_PRIOR,
@@ -59,7 +57,6 @@ if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
-    from ..photogrammetry.precision import Precision
 
 SETTLED_VARIATION = 0.05  # relative change of the RMS variation between exposures
 # Number of updates without visible change after which the priors stay fixed. Otherwise noise and
@@ -96,7 +93,6 @@ class CollocationTerms(AdjustedTerms):
         earlier: EarlierTerms | None = None,
     ) -> None:
         self.network = problem.network
-        self.gauge_kinds = problem.gauges
         self.parts: list[FluoroscopeTerms] = []
         self._more_places: list[MorePlaces] = []
         self._steady_renewals = 0
@@ -106,7 +102,7 @@ class CollocationTerms(AdjustedTerms):
         for f in range(len(problem.image_sizes)):
             self.parts.append(FluoroscopeTerms.first(problem, f, modes))
             self._more_places.append(MorePlaces())
-        self._start = self.zeros()
+        self._start = super().start()
         self._refinements: list[Refinement] = [
             NumberOfSines(),
             Once(ripples),  # before exposure_terms: ripples may be mistaken for such a change
@@ -134,36 +130,13 @@ class CollocationTerms(AdjustedTerms):
             self._refinements.append(Once(places))
 
     @property
-    def functions(self) -> list[Functions]:
-        """Functions, by fluoroscope."""
-        return [part.functions for part in self.parts]
-
-    @property
-    def values(self) -> list[NDArray[np.float64]]:
-        """See `AdjustedTerms`."""
-        return [part.values for part in self.parts]
-
-    @property
     def priors(self) -> list[Prior]:
         """Present priors, by fluoroscope."""
         return [part.prior for part in self.parts]
 
-    @property
-    def exposure_terms(self) -> list[ExposureTerms | None]:
-        """Terms of exposures, by fluoroscope."""
-        return [part.own for part in self.parts]
-
     def start(self) -> tuple[NDArray[np.float64], ...]:
         """Return the initial coefficients, by fluoroscope."""
         return self._start
-
-    def zeros(self) -> tuple[NDArray[np.float64], ...]:
-        """Return the coefficients of no correction, by fluoroscope."""
-        return tuple(np.zeros(part.count) for part in self.parts)
-
-    def with_additional(self, network: Network) -> Network:
-        """Return the network with the terms as additional parameters with their priors."""
-        return replace(network, additional=tuple(part.additional() for part in self.parts))
 
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
@@ -229,28 +202,6 @@ class CollocationTerms(AdjustedTerms):
             part.own = change.exposure_terms.get(f, part.own)
             out.append(np.pad(new, (0, part.count - len(new))))
         return tuple(out)
-
-    def fit_angles(self, f: int, adjustment: Adjustment, precise: Precision) -> AngleField | None:
-        """See `AdjustedTerms`."""
-        fit = self.parts[f].fit_angles(adjustment, precise)
-        return None if fit is None else fit.field
-
-    def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
-        """See `AdjustedTerms`; with a field of the angle, the series that belongs to it."""
-        return self.parts[f].fitted_series(adjustment, precise)
-
-    def left_out(self, f: int) -> LeftOut | None:
-        """Return the signal that the sines of fluoroscope f omit."""
-        return self.parts[f].left_out()
-
-    def variance_between_exposures(
-        self, f: int, network: Network, adjustment: Adjustment, precise: Precision
-    ) -> NDArray[np.float64]:
-        """See `AdjustedTerms`."""
-        variances = self.parts[f].variance_between_exposures(network, adjustment, precise)
-        if variances is None:
-            return super().variance_between_exposures(f, network, adjustment, precise)
-        return variances
 
 
 def _renew_prior(

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -42,12 +42,13 @@ from ..photogrammetry.rotations import matrix_from_vector
 from .lack_of_fit import LeftOut
 
 if TYPE_CHECKING:
-    from ..correction.angle_field import AngleField
     from ..correction.series import Series
     from ..photogrammetry.adjustment import Adjustment
+    from ..photogrammetry.collinearity import AdditionalParameters
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
     from ..photogrammetry.precision import Precision
+    from .exposure_terms import AngleFit
 
 
 class GaugeKind(Enum):
@@ -249,9 +250,61 @@ class TrainingPoints:
     trend: NDArray[np.float64] | None = None
 
 
+class TermsOfFluoroscope(ABC):
+    """Terms of the correction of one fluoroscope that the adjustment estimates."""
+
+    values: NDArray[np.float64]  #: (n, m) or (n, 2, p) functions at its n image points
+
+    def __init__(self, problem: AdjustmentProblem, number: int) -> None:
+        self.number = number  #: number of the fluoroscope in the network
+        self.rows = problem.network.rows(number)
+        self.uv = problem.network.uv[self.rows]  #: (n, 2) image points [px]
+        self.image_size = problem.image_sizes[number]  #: width and height [px]
+        self.gauge_kind = problem.gauges[number]
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """Number of coefficients."""
+
+    @abstractmethod
+    def additional(self) -> AdditionalParameters:
+        """Return the terms as additional parameters."""
+
+    @abstractmethod
+    def fitted_series(self, adjustment: Adjustment, precise: Precision) -> Series:
+        """Return the series that an adjustment has estimated.
+
+        With a field of the angle, it is the series that belongs to the field.
+        """
+
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """Return what the series omits by design."""
+        return ()
+
+    def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleFit | None:
+        """Fit differences between the exposures to the angles of the C-arm.
+
+        Afterwards the series and the variance between exposures are those that remain with this
+        field. None: there is no such field.
+        """
+        return None
+
+    def variance_between_exposures(
+        self, network: Network, adjustment: Adjustment, precise: Precision
+    ) -> NDArray[np.float64]:
+        """Return variances [px^2] between exposures of the distortion.
+
+        The variances are those of the inliers (i,), without the part that orientations absorb.
+        network: with the terms as additional parameters; adjustment and precise: of this network.
+        """
+        return np.zeros(int(adjustment.inliers[self.rows].sum()))
+
+
 class AdjustedTerms(ABC):
     """Terms of the corrections of all fluoroscopes of a network that the adjustment estimates."""
 
+    parts: Sequence[TermsOfFluoroscope]
     #: decrease of the cost at which an adjustment before the last may stop
     intermediate_tolerance: float
     final_tolerance = FINAL_TOLERANCE  #: decrease of the cost that the last adjustment may leave
@@ -260,22 +313,13 @@ class AdjustedTerms(ABC):
     #: whether updating the terms needs the normal matrix at a solution, not one near it
     needs_solution = False
 
-    @property
-    @abstractmethod
-    def values(self) -> list[NDArray[np.float64]]:
-        """Functions at the image points of each fluoroscope, (N, m) or (N, 2, p)."""
-
-    @abstractmethod
     def with_additional(self, network: Network) -> Network:
         """Return the network with the terms as additional parameters."""
+        return replace(network, additional=tuple(part.additional() for part in self.parts))
 
     def start(self) -> tuple[NDArray[np.float64], ...]:
-        """Return the initial coefficients, by fluoroscope."""
-        return self.zeros()
-
-    @abstractmethod
-    def zeros(self) -> tuple[NDArray[np.float64], ...]:
-        """Return the coefficients of no correction, by fluoroscope."""
+        """Return the initial coefficients, by fluoroscope; by default those of no correction."""
+        return tuple(np.zeros(part.count) for part in self.parts)
 
     @abstractmethod
     def renew(
@@ -285,32 +329,6 @@ class AdjustedTerms(ABC):
 
         Returns whether nothing changed, and the coefficients to continue with.
         """
-
-    def left_out(self, f: int) -> LeftOut | None:
-        """Return what the series of fluoroscope f omits by design; None: nothing."""
-        return None
-
-    def fit_angles(self, f: int, adjustment: Adjustment, precise: Precision) -> AngleField | None:
-        """Fit differences between the exposures of fluoroscope f to the angles of the C-arm.
-
-        Afterwards the series and the variance between exposures are those that remain with this
-        field. None: there is no such field.
-        """
-        return None
-
-    def variance_between_exposures(
-        self, f: int, network: Network, adjustment: Adjustment, precise: Precision
-    ) -> NDArray[np.float64]:
-        """Return variances [px^2] between exposures of the distortion of fluoroscope f.
-
-        The variances are those of the inliers (i,), without the part that orientations absorb.
-        network: with the terms as additional parameters; adjustment and precise: of this network.
-        """
-        return np.zeros(int(adjustment.inliers[network.rows(f)].sum()))
-
-    @abstractmethod
-    def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
-        """Return the series of fluoroscope f that an adjustment has estimated."""
 
 
 class RegressionStep(ABC, Generic[Model_co]):

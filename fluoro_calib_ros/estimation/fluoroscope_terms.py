@@ -16,7 +16,13 @@ from ..correction.series import Functions, Series, sd_over_image, without_absent
 from ..correction.terms import CUBIC
 from ..photogrammetry.collinearity import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
-from .estimator import AdjustmentProblem, coefficients_of, estimated_terms, prior_of_additional
+from .estimator import (
+    AdjustmentProblem,
+    TermsOfFluoroscope,
+    coefficients_of,
+    estimated_terms,
+    prior_of_additional,
+)
 from .exposure_terms import (
     AngleFit,
     ExposureTerms,
@@ -26,7 +32,7 @@ from .exposure_terms import (
     variance_between_exposures,
     without_exposure_terms,
 )
-from .lack_of_fit import FittedPoints, LeftOut, LeftOutInPlaces
+from .lack_of_fit import FittedPoints, LeftOut
 from .local_signal import correlation_beyond
 from .priors import (
     Prior,
@@ -52,21 +58,17 @@ RINGS = 2  # radial polynomials of degree 5 and 7, which a curved screen adds at
 MIN_START_SD_PX = 0.1
 
 
-class FluoroscopeTerms:
+class FluoroscopeTerms(TermsOfFluoroscope):
     """Trend and signal of one fluoroscope, and the terms of its exposures."""
 
     prior: Prior
 
     def __init__(self, problem: AdjustmentProblem, number: int, functions: Functions) -> None:
+        super().__init__(problem, number)
         network = problem.network
-        self.number = number  #: number of the fluoroscope in the network
-        self.rows = network.rows(number)
-        self.uv = network.uv[self.rows]  #: (n, 2) image points [px]
         self.sigma = network.sigma[self.rows]
         self.exposure = network.exposure[self.rows]
         self.point = network.point[self.rows]
-        self.image_size = problem.image_sizes[number]  #: width and height [px]
-        self.gauge_kind = problem.gauges[number]
         #: (e,) angles of the C-arm [rad]; empty if unknown
         self.angles = np.zeros(0) if problem.angles is None else problem.angles[number]
         #: (3,) xp, yp, c [px] at the last solution
@@ -239,7 +241,7 @@ class FluoroscopeTerms:
         )
 
     def fitted_series(self, adjustment: Adjustment, precise: Precision) -> Series:
-        """See `AdjustedTerms`; with a field of the angle, the series that belongs to it."""
+        """See `TermsOfFluoroscope`."""
         fit = self._angle_fit
         if fit is not None:
             return self.series(fit.coefficients, fit.covariance)
@@ -256,7 +258,7 @@ class FluoroscopeTerms:
         return self.series(coefficients, covariance)
 
     def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleFit | None:
-        """Fit the terms of exposures to the angles of the C-arm; None: they do not follow them."""
+        """See `TermsOfFluoroscope`; None: the terms of exposures do not follow the angles."""
         covariance = precise.additional[self.number]
         if self.own is None or covariance is None or not can_be_fitted(self.angles):
             return None
@@ -267,29 +269,32 @@ class FluoroscopeTerms:
         self._angle_fit = fit_angles(estimated, self.angles)
         return self._angle_fit
 
-    def left_out(self) -> LeftOut | None:
-        """Return the signal that the sines omit; None: there is no signal."""
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """Return the signal that the sines omit: of the fields, and of places."""
         functions = self.functions
         if not functions.modes:
-            return None
+            return ()
         signal = self.prior.signal
         local = self.prior.local
-        places = None
-        if local is not None:
-            places = LeftOutInPlaces(
-                partial(local.variance_beyond, functions), partial(correlation_beyond, functions)
-            )
-        highest = functions.highest
-        correlation = partial(signal.correlation_beyond, highest)
-        return LeftOut(signal.sd_beyond(highest), correlation, places)
+        variance = signal.sd_beyond(functions.highest) ** 2
+        of_fields = LeftOut(
+            lambda uv: np.full(len(uv), variance),
+            partial(signal.correlation_beyond, functions.highest),
+        )
+        if local is None:
+            return (of_fields,)
+        of_places = LeftOut(
+            partial(local.variance_beyond, functions), partial(correlation_beyond, functions)
+        )
+        return of_fields, of_places
 
     def variance_between_exposures(
         self, network: Network, adjustment: Adjustment, precise: Precision
-    ) -> NDArray[np.float64] | None:
-        """See `AdjustedTerms`; None: there are no terms of exposures."""
+    ) -> NDArray[np.float64]:
+        """See `TermsOfFluoroscope`."""
         covariance = precise.additional[self.number]
         if self.own is None or covariance is None:
-            return None
+            return super().variance_between_exposures(network, adjustment, precise)
         coefficients = coefficients_of(adjustment)[self.number]
         last = slice(-self.own.count, None)
         remaining = 1.0 if self._angle_fit is None else self._angle_fit.remaining

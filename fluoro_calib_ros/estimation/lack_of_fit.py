@@ -23,7 +23,7 @@ Models", 1989, 10.3).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,20 +90,8 @@ class RejectedArea:
 class LeftOut:
     """Signal that a series omits by design, as expected from its covariance function.
 
-    sd_px: standard deviation [px]; correlation: function of distances (n,) [px]; places: what is
-    omitted in places of larger variance, None: there are no such places.
-    """
-
-    sd_px: float
-    correlation: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-    places: LeftOutInPlaces | None = None
-
-
-@dataclass(frozen=True)
-class LeftOutInPlaces:
-    """Signal that a series omits in places where the signal has a larger variance.
-
-    variance: function of pixels (n, 2), returns [px^2]; correlation: as in `LeftOut`.
+    variance: function of pixels (n, 2), returns (n,) [px^2]; correlation: function of distances
+    (n,) [px].
     """
 
     variance: Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -190,22 +178,21 @@ def _growth(
 
 
 def sd_with_lack_of_fit(
-    points: FittedPoints, series: Series, left_out: LeftOut | None = None
+    points: FittedPoints, series: Series, left_out: Sequence[LeftOut] = ()
 ) -> NDArray[np.float64]:
     """Return standard deviations (33, 33) [px] of a series with its lack of fit, on its grid.
 
-    series: its standard deviations are those of its coefficients alone.
+    series: its standard deviations are those of its coefficients alone; it omits signals left_out.
     """
     products = _products(points)
     variance = series.sd**2
-    if len(products.uv) < 2 * POINTS:
-        return variance**0.5 if left_out is None else np.hypot(series.sd, left_out.sd_px)
     pixels = sd_grid_pixels(series.functions.image_size)
+    if len(products.uv) < 2 * POINTS:
+        expected = sum((signal.variance(pixels) for signal in left_out), np.zeros(len(pixels)))
+        return np.sqrt(variance + expected.reshape(variance.shape))
     left_out_variance = np.zeros(len(pixels))
-    if left_out is not None:
-        left_out_variance += _variance_beyond(products, series, left_out)
-        if left_out.places is not None:
-            left_out_variance += _variance_in_places(products, series, left_out.places, pixels)
+    for signal in left_out:
+        left_out_variance += _variance_left_out(products, series, signal, pixels)
     _, neighbours = cKDTree(products.uv).query(pixels, k=POINTS)
     mean = products.value[neighbours].mean(axis=1)
     # Each product occurs twice among the points about a node.
@@ -313,17 +300,17 @@ class _Area:
         return float(np.linalg.norm(self.of_target.mean(axis=0))) if agree else 0.0
 
 
-def _variance_in_places(
-    products: _Products, series: Series, places: LeftOutInPlaces, pixels: NDArray[np.float64]
+def _variance_left_out(
+    products: _Products, series: Series, left_out: LeftOut, pixels: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return variances (n,) [px^2] at pixels (n, 2) of what a series omits in places.
+    """Return variances (n,) [px^2] at pixels (n, 2) of what a series omits.
 
-    The expected variances are scaled to those that the products in these places show.
+    The expected variances are scaled to those that the products in its places show.
     """
-    expected = places.variance(products.uv)
+    expected = left_out.variance(products.uv)
     inside = expected > PLACE * np.max(expected, initial=0.0)
     if not inside.any():
-        return places.variance(pixels)
+        return left_out.variance(pixels)
     selected = replace(
         products,
         **{
@@ -332,13 +319,19 @@ def _variance_in_places(
         },
     )
     mean = float(np.mean(expected[inside]))
-    variance = _variance_beyond(selected, series, LeftOut(mean**0.5, places.correlation))
-    return variance / mean * places.variance(pixels)
+    variance = _variance_beyond(selected, series, mean, left_out.correlation)
+    return variance / mean * left_out.variance(pixels)
 
 
-def _variance_beyond(products: _Products, series: Series, left_out: LeftOut) -> float:
+def _variance_beyond(
+    products: _Products,
+    series: Series,
+    expected: float,
+    correlation_at: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> float:
     """Return the variance [px^2] that a series omits, by covariance function and residuals.
 
+    expected: variance by the covariance function [px^2]; correlation_at: function of distances.
     The covariance function was estimated from the functions that the series has; beyond them it is
     an extrapolation. The expected variance is uncertain and positive, and gets an exponential
     prior; the variance that the residuals show has a Gaussian error. The result is the mean of the
@@ -346,10 +339,9 @@ def _variance_beyond(products: _Products, series: Series, left_out: LeftOut) -> 
     come from differences between exposures, and is left to the test of significance.
     """
     mean, error = products.mean_of_all()
-    expected = left_out.sd_px**2
     redundancy = float(products.shown.mean())
-    correlation = float(np.mean(left_out.correlation(products.distance)))
-    if not expected > 0 or not 0 < error < np.inf or correlation < MIN_CORRELATION:
+    correlation = float(np.mean(correlation_at(products.distance)))
+    if not 0 < error < np.inf or correlation < MIN_CORRELATION:
         return expected
     error /= redundancy * correlation
     observed = (mean / redundancy + float(np.mean(series.sd_at(products.uv) ** 2))) / correlation

@@ -146,13 +146,14 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
     run: self-calibration by collocation; terms: its terms.
     """
     assert isinstance(terms, CollocationTerms)
-    if any(part_terms is not None for part_terms in terms.exposure_terms):
+    if any(part.own is not None for part in terms.parts):
         return None  # no other model can follow differences between exposures
     network = run.measured.network
     after = run.after
     inside = after.inliers
+    gauges = [part.gauge_kind for part in terms.parts]
     parametric = StepwiseTerms(
-        AdjustmentProblem(terms.network, run.measured.image_size, run.before, terms.gauge_kinds)
+        AdjustmentProblem(terms.network, run.measured.image_size, run.before, gauges)
     )
     scores = dict.fromkeys((START_MODEL, *ALTERNATIVES), 0.0)
     for f, part in enumerate(terms.parts):
@@ -179,7 +180,7 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
         held_out = {
             START_MODEL: _held_out(prior, part.functions(uv), values, weight, fold),
             'parametric': _held_out_of_terms(
-                parametric.values[f][inside[network.rows(f)]], values, weight, fold
+                parametric.parts[f].values[inside[network.rows(f)]], values, weight, fold
             ),
         }
         for kind, predicted in held_out.items():

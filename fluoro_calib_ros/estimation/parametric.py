@@ -11,7 +11,6 @@ stays if either of the other two criteria holds.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +27,7 @@ from .estimator import (
     AdjustedTerms,
     AdjustmentProblem,
     GaugeKind,
+    TermsOfFluoroscope,
     coefficients_of,
     estimated_terms,
     gauge_basis,
@@ -115,58 +115,11 @@ class StepwiseTerms(AdjustedTerms):
     needs_solution = True
 
     def __init__(self, problem: AdjustmentProblem) -> None:
-        self.network = problem.network
         # The terms keep what no orientation can absorb.
         self.names, terms = expert_terms(GaugeKind.NONE in problem.gauges)
-        self.functions: list[Functions] = []
-        self._values: list[NDArray[np.float64]] = []
-        self._maps: list[NDArray[np.float64]] = []
-        self._near: list[NDArray[np.int64]] = []
-        for f, size in enumerate(problem.image_sizes):
-            uv = self.network.uv[self.network.rows(f)]
-            functions = Functions(size, HIGHEST)
-            values = functions(uv)
-            interior = problem.before.parameters.interior[f]
-            # The terms themselves have no shift, scale or tilt.
-            gauge_kind = problem.gauges[f]
-            gauge_kind = GaugeKind.NONE if gauge_kind is GaugeKind.TREND else gauge_kind
-            terms_f = _without_gauge(terms, values, gauge_basis(uv, interior, gauge_kind))
-            self.functions.append(functions)
-            self._maps.append(terms_f.reshape(len(terms), -1))
-            self._values.append(np.einsum('nm,tam->nat', values, terms_f))
-            count = min(NEIGHBOURS + 1, len(uv))
-            self._near.append(cKDTree(uv).query(uv, k=np.arange(2, count + 1))[1])
-        #: by fluoroscope: whether each term (31,) is in the model
-        self.selected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
-        self._rejected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
-
-    @property
-    def values(self) -> list[NDArray[np.float64]]:
-        """See `AdjustedTerms`."""
-        return self._values
-
-    def with_additional(self, network: Network) -> Network:
-        """Return the network with the terms; terms that are not selected are fixed at zero."""
-        additional = tuple(
-            AdditionalParameters(values, np.diag(np.where(selected, 0.0, ZERO_PRECISION)))
-            for values, selected in zip(self._values, self.selected)
-        )
-        return replace(network, additional=additional)
-
-    def zeros(self) -> tuple[NDArray[np.float64], ...]:
-        """Return the coefficients of no correction, by fluoroscope."""
-        return tuple(np.zeros(len(self.names)) for _ in self.functions)
-
-    def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
-        """See `AdjustedTerms`."""
-        coefficients, covariance = estimated_terms(f, adjustment, precise)
-        functions = self.functions[f]
-        to_polynomials = self._maps[f]
-        return Series(
-            functions,
-            (coefficients @ to_polynomials).reshape(2, -1),
-            sd_over_image(functions, to_polynomials.T @ covariance @ to_polynomials),
-        )
+        self.parts: list[ExpertTerms] = [
+            ExpertTerms(problem, f, terms) for f in range(len(problem.image_sizes))
+        ]
 
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
@@ -175,53 +128,93 @@ class StepwiseTerms(AdjustedTerms):
 
         Returns whether all terms stay the same, and the coefficients to continue with.
         """
-        changed = [self._step(f, network, matrix, adjustment) for f in range(len(self.functions))]
+        changed = [part.step(network, matrix, adjustment) for part in self.parts]
         return not any(changed), coefficients_of(adjustment)
 
-    def _step(
-        self, f: int, network: Network, matrix: FactorizedNormalMatrix, result: Adjustment
-    ) -> bool:
-        """Add the best term of fluoroscope f, or remove a term that has become insignificant."""
-        prior = prior_of_additional(network, f)
-        information = information_of_additional(matrix, f) - prior
-        coefficients = coefficients_of(result)[f]
-        selected = self.selected[f]
-        rows = network.rows(f)
-        dof = 2 * len(rows) - network.n_unknowns + len(self.names) * len(self.selected)
+
+class ExpertTerms(TermsOfFluoroscope):
+    """Terms of one fluoroscope, and their selection.
+
+    terms: (t, 2, m) coefficients of polynomials in u and v.
+    """
+
+    def __init__(
+        self, problem: AdjustmentProblem, number: int, terms: NDArray[np.float64]
+    ) -> None:
+        super().__init__(problem, number)
+        self.functions = Functions(self.image_size, HIGHEST)
+        polynomials = self.functions(self.uv)
+        interior = problem.before.parameters.interior[number]
+        # The terms themselves have no shift, scale or tilt.
+        kind = GaugeKind.NONE if self.gauge_kind is GaugeKind.TREND else self.gauge_kind
+        terms = _without_gauge(terms, polynomials, gauge_basis(self.uv, interior, kind))
+        #: (t, 2m) coefficients of the polynomials in each term
+        self.to_polynomials = terms.reshape(len(terms), -1)
+        self.values = np.einsum('nm,tam->nat', polynomials, terms)
+        count = min(NEIGHBOURS + 1, len(self.uv))
+        self._near = cKDTree(self.uv).query(self.uv, k=np.arange(2, count + 1))[1]
+        #: (t,) whether each term is in the model
+        self.selected = np.zeros(len(terms), dtype=bool)
+        self._rejected = np.zeros(len(terms), dtype=bool)
+
+    @property
+    def count(self) -> int:
+        """See `TermsOfFluoroscope`."""
+        return len(self.selected)
+
+    def additional(self) -> AdditionalParameters:
+        """Return the terms; terms that are not selected are fixed at zero."""
+        precision = np.where(self.selected, 0.0, ZERO_PRECISION)
+        return AdditionalParameters(self.values, np.diag(precision))
+
+    def fitted_series(self, adjustment: Adjustment, precise: Precision) -> Series:
+        """See `TermsOfFluoroscope`."""
+        coefficients, covariance = estimated_terms(self.number, adjustment, precise)
+        return Series(
+            self.functions,
+            (coefficients @ self.to_polynomials).reshape(2, -1),
+            sd_over_image(
+                self.functions, self.to_polynomials.T @ covariance @ self.to_polynomials
+            ),
+        )
+
+    def step(self, network: Network, matrix: FactorizedNormalMatrix, result: Adjustment) -> bool:
+        """Add the best term, or remove a term that has become insignificant."""
+        prior = prior_of_additional(network, self.number)
+        information = information_of_additional(matrix, self.number) - prior
+        coefficients = coefficients_of(result)[self.number]
+        selected = self.selected
+        dof = 2 * len(self.rows) - network.n_unknowns + self.count * network.n_fluoroscopes
         if network.exterior is not None:
             # Most unknowns are known beforehand.
             dof += network.n_observations - 2 * network.n_image_points
         # Significance of all terms together that are tested for one fluoroscope.
-        limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * len(self.names)))  # quantile of t
-        if self._remove_insignificant(f, information, coefficients, limit):
+        limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * self.count))  # quantile of t
+        if self._remove_insignificant(information, coefficients, limit):
             return True
         score = prior @ coefficients  # gradient of the likelihood by terms fixed at zero
         mixed = np.linalg.solve(information[np.ix_(selected, selected)], information[selected])
         reduced = np.diagonal(information) - np.einsum('ij,ij->j', information[selected], mixed)
         dependent = reduced <= 1e-9 * np.diagonal(information)
         with np.errstate(divide='ignore', invalid='ignore'):
-            excluded = selected | self._rejected[f] | dependent
+            excluded = selected | self._rejected | dependent
             t = np.where(excluded, 0, score / np.sqrt(reduced))
         for best in np.argsort(-np.abs(t)):
             if abs(t[best]) < limit:
                 return False
             direction = -mixed[:, best] if selected.any() else np.zeros(0)
-            change = self._values[f][:, :, best] + self._values[f][:, :, selected] @ direction
-            if self._improves(f, result, rows, change * score[best] / reduced[best], t[best]):
+            change = self.values[:, :, best] + self.values[:, :, selected] @ direction
+            if self._improves(result, change * score[best] / reduced[best], t[best]):
                 selected[best] = True
                 return True
-            self._rejected[f][best] = True
+            self._rejected[best] = True
         return False
 
     def _remove_insignificant(
-        self,
-        f: int,
-        information: NDArray[np.float64],
-        coefficients: NDArray[np.float64],
-        limit: float,
+        self, information: NDArray[np.float64], coefficients: NDArray[np.float64], limit: float
     ) -> bool:
         """Reject the least significant selected term for good if it is below the limit of t."""
-        selected = np.flatnonzero(self.selected[f])
+        selected = np.flatnonzero(self.selected)
         if not len(selected):
             return False
         sd = np.sqrt(np.diagonal(np.linalg.inv(information[np.ix_(selected, selected)])))
@@ -229,31 +222,24 @@ class StepwiseTerms(AdjustedTerms):
         worst = int(np.argmin(t))
         if t[worst] >= limit:
             return False
-        self.selected[f][selected[worst]] = False
-        self._rejected[f][selected[worst]] = True
+        self.selected[selected[worst]] = False
+        self._rejected[selected[worst]] = True
         return True
 
-    def _improves(
-        self,
-        f: int,
-        result: Adjustment,
-        rows: NDArray[np.int64],
-        change: NDArray[np.float64],
-        t: float,
-    ) -> bool:
+    def _improves(self, result: Adjustment, change: NDArray[np.float64], t: float) -> bool:
         """Whether a significant change (n, 2) of the correction reduces the RMSE or the trend."""
-        inliers = result.inliers[rows]
-        residuals = result.residuals[rows]
-        square = np.sum(result.q[rows][inliers])
+        inliers = result.inliers[self.rows]
+        residuals = result.residuals[self.rows]
+        square = np.sum(result.q[self.rows][inliers])
         drop = 1 - np.sqrt(max(square - t * t, 0.0) / square)
         if drop >= MIN_DROP:
             return True
-        return self._trend(f, residuals - change, inliers) < self._trend(f, residuals, inliers)
+        return self._trend(residuals - change, inliers) < self._trend(residuals, inliers)
 
-    def _trend(self, f: int, residuals: NDArray[np.float64], core: NDArray[np.bool_]) -> float:
+    def _trend(self, residuals: NDArray[np.float64], core: NDArray[np.bool_]) -> float:
         """Return the mean product of residuals with the mean of their neighbours [px^2]."""
         inside = np.where(core[:, None], residuals, 0.0)
-        return float(np.mean(np.sum(inside * inside[self._near[f]].mean(axis=1), axis=1)))
+        return float(np.mean(np.sum(inside * inside[self._near].mean(axis=1), axis=1)))
 
 
 def _without_gauge(

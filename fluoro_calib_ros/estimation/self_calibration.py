@@ -296,7 +296,7 @@ class _Job:
                 network.exposure[rows],
                 self.measured.image_size[f],
                 self.gauges[f],
-                None if terms is None else terms.values[f],
+                None if terms is None else terms.parts[f].values,
             )
             step = source.regression(points, self.options.k)
             if step is None:
@@ -372,13 +372,11 @@ def calibrate_by_adjustment(
         network, parameters = in_determined_datum(network, after.parameters, after.inliers)
         after = replace(after, parameters=parameters)
         precise = precision(network, after)
-        fields = {
-            name: terms.fit_angles(f, after, precise)
-            for f, name in enumerate(measured.fluoroscopes)
-        }
+        parts = dict(zip(measured.fluoroscopes, terms.parts))
+        fits = {name: part.fit_angles(after, precise) for name, part in parts.items()}
         between = {
-            name: terms.variance_between_exposures(f, network, after, precise)
-            for f, name in enumerate(measured.fluoroscopes)
+            name: part.variance_between_exposures(network, after, precise)
+            for name, part in parts.items()
         }
     except np.linalg.LinAlgError:
         raise undetermined(measured.network) from None
@@ -394,7 +392,7 @@ def calibrate_by_adjustment(
         history=tuple(history.rounds),
         converged=converged,
         between_exposures=between,
-        angle_fields={name: field for name, field in fields.items() if field is not None},
+        angle_fields={name: fit.field for name, fit in fits.items() if fit is not None},
     )
 
 
@@ -413,17 +411,16 @@ def _models(
     values = after.residuals + network.additional_correction(after.parameters)
     models = {}
 
-    for f, name in enumerate(measured.fluoroscopes):
-        rows = network.rows(f)
-        rows = rows[after.inliers[rows]]
-        series = terms.fitted_series(f, after, precise)
+    for name, part in zip(measured.fluoroscopes, terms.parts):
+        rows = part.rows[after.inliers[part.rows]]
+        series = part.fitted_series(after, precise)
         inliers = FittedPoints(
             network.uv[rows],
             after.residuals[rows],
             network.exposure[rows],
             precise.redundancy[rows].mean(axis=1),
         )
-        sd = sd_with_lack_of_fit(inliers, series, terms.left_out(f))
+        sd = sd_with_lack_of_fit(inliers, series, part.left_out())
         models[name] = model_type(0, network.uv[rows], values[rows], series=replace(series, sd=sd))
     return models
 

@@ -273,9 +273,7 @@ class EliminatePoints(Elimination):
         remaining[rows[b][:, :, None], rows[a][:, None, :]] = equations.coupled.transpose(0, 2, 1)
         if equations.gauge is not None:
             self._fix_gauge(remaining, equations.gauge.exteriors)
-        return BorderedSystem(
-            equations.pp, border, remaining, *self.right_sides(equations.right)
-        )
+        return BorderedSystem(equations.pp, border, remaining, *self.right_sides(equations.right))
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return right sides of points (n, 3, ...), and of exposures and free globals (q, ...)."""

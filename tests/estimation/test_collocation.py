@@ -774,12 +774,12 @@ def test_stepwise_selects_the_true_terms():
         return DistortionField(np.array([511.5, 511.5]), 9.5, np.zeros(2), 2.0, np.zeros((0, 5)))
 
     _, state = whole(rig_with(smooth), 'parametric')
-    names = {name for name, there in zip(state.names, state.selected[0]) if there}
+    names = {name for name, there in zip(state.names, state.parts[0].selected) if there}
     assert {'radial 1', 'spiral 1'} <= names and len(names) <= 4
     _, state = whole(
         rig_with(lambda field: replace(smooth(field), pincushion=0.0, spiral=0.0)), 'parametric'
     )
-    assert state.selected[0].sum() <= 1
+    assert state.parts[0].selected.sum() <= 1
 
 
 class Woven(DistortionField):

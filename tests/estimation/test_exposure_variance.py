@@ -167,7 +167,9 @@ def test_a_self_calibration_renews_its_terms_of_exposures_until_they_settle(case
     terms = CollocationTerms(problem, modes=0)
     terms._refinements = []
     terms.parts[0].own = ExposureTerms(true.functions.values, network.exposure, 0.3 * SIZE_PX)
-    parameters = replace(found.parameters, additional=terms.zeros())
+    parameters = replace(
+        found.parameters, additional=tuple(np.zeros(part.count) for part in terms.parts)
+    )
     sizes = []
     for _ in range(5):
         varying = terms.with_additional(network)

@@ -13,7 +13,6 @@ from fluoro_calib_ros.estimation.lack_of_fit import (
     MIN_TARGETS,
     FittedPoints,
     LeftOut,
-    LeftOutInPlaces,
     _Products,
     _products,
     _variance_beyond,
@@ -94,8 +93,9 @@ def test_variance_beyond_a_series_is_the_mean_of_a_truncated_gaussian(mean, sd):
     """An exponential prior shifts a Gaussian; the variance is positive."""
     error, part, correlation, expected = 0.006, 0.6, 0.7, 0.05
     products = products_with(mean, error, part)
-    left_out = LeftOut(expected**0.5, lambda distance: np.full(len(distance), correlation))
-    found = _variance_beyond(products, flat_series(sd), left_out)
+    found = _variance_beyond(
+        products, flat_series(sd), expected, lambda distance: np.full(len(distance), correlation)
+    )
     of_variance = error / (part * correlation)
     middle = (mean / part + sd**2) / correlation - of_variance**2 / expected
     posterior = truncnorm(-middle / of_variance, np.inf, middle, of_variance)
@@ -103,9 +103,9 @@ def test_variance_beyond_a_series_is_the_mean_of_a_truncated_gaussian(mean, sd):
 
 
 def test_variance_beyond_a_series_far_below_zero_is_that_of_the_tail():
-    left_out = LeftOut(0.2, np.ones_like)
     found = [
-        _variance_beyond(products_with(m, 1e-3), flat_series(0.0), left_out) for m in (-0.05, -0.1)
+        _variance_beyond(products_with(m, 1e-3), flat_series(0.0), 0.04, np.ones_like)
+        for m in (-0.05, -0.1)
     ]
     assert found[0] == pytest.approx((1e-3 / 0.6) ** 2 / (0.05 / 0.6 + 7e-5), rel=0.02)
     assert found[0] == pytest.approx(2 * found[1], rel=0.02)
@@ -113,16 +113,13 @@ def test_variance_beyond_a_series_far_below_zero_is_that_of_the_tail():
 
 def test_products_that_show_nothing_leave_what_is_expected():
     def beyond(products, correlation=1.0):
-        left_out = LeftOut(0.3, lambda distance: np.full(len(distance), correlation))
-        return _variance_beyond(products, flat_series(0.0), left_out)
+        return _variance_beyond(
+            products, flat_series(0.0), 0.09, lambda distance: np.full(len(distance), correlation)
+        )
 
     assert beyond(products_with(0.0, 1e-3), 0.04) == pytest.approx(0.09)
     assert beyond(products_with(0.0, 1e-3), 0.06) < 0.03
     assert beyond(products_with(0.0, 0.0)) == pytest.approx(0.09)
-    assert (
-        _variance_beyond(products_with(1.0, 1e-3), flat_series(0.0), LeftOut(0.0, np.ones_like))
-        == 0
-    )
 
 
 def test_what_is_left_out_in_places_is_scaled_by_what_these_show():
@@ -135,19 +132,21 @@ def test_what_is_left_out_in_places_is_scaled_by_what_these_show():
 
     common = np.sqrt(0.5 * variance(uv))[:, None] * np.sign(np.sin(uv / 60))
     residuals = common + rng.normal(0, 0.05, uv.shape)
-    places = LeftOutInPlaces(variance, np.ones_like)
-    left_out = LeftOut(0.0, np.ones_like, places)
+    left_out = (LeftOut(variance, np.ones_like),)
     found = sd_with_lack_of_fit(FittedPoints(uv, residuals, exposure), flat_series(0.01), left_out)
     row, column = round(250 / 600 * (SD_GRID - 1)), round(300 / 800 * (SD_GRID - 1))
     assert found[row, column] ** 2 == pytest.approx(0.15, rel=0.35)
     quiet = rng.normal(0, 0.05, uv.shape)
     nothing = sd_with_lack_of_fit(FittedPoints(uv, quiet, exposure), flat_series(0.01), left_out)
     assert nothing[row, column] < 0.06
+    none = LeftOut(lambda at: np.zeros(len(at)), np.ones_like)
+    same = sd_with_lack_of_fit(FittedPoints(uv, quiet, exposure), flat_series(0.01), [none])
+    np.testing.assert_allclose(same, 0.01)
     # Without image points, the expected variance stays.
     away = np.linalg.norm(uv - middle, axis=1) > 320
     there = FittedPoints(uv[away], quiet[away], exposure[away])
-    elsewhere = LeftOutInPlaces(lambda at: variance(at) * (len(at) == SD_GRID**2), np.ones_like)
-    kept = sd_with_lack_of_fit(there, flat_series(0.01), LeftOut(0.0, np.ones_like, elsewhere))
+    elsewhere = LeftOut(lambda at: variance(at) * (len(at) == SD_GRID**2), np.ones_like)
+    kept = sd_with_lack_of_fit(there, flat_series(0.01), [elsewhere])
     assert kept[row, column] ** 2 == pytest.approx(0.3, rel=0.1)
 
 
@@ -155,7 +154,8 @@ def test_few_image_points_leave_a_series_what_it_claims():
     uv, exposure, _ = image_points(100)
     few = FittedPoints(uv, np.ones_like(uv), exposure)
     np.testing.assert_allclose(sd_with_lack_of_fit(few, flat_series(0.3)), 0.3)
-    found = sd_with_lack_of_fit(few, flat_series(0.3), LeftOut(0.4, np.ones_like))
+    everywhere = LeftOut(lambda at: np.full(len(at), 0.16), np.ones_like)
+    found = sd_with_lack_of_fit(few, flat_series(0.3), [everywhere])
     np.testing.assert_allclose(found, 0.5)
 
 

@@ -252,7 +252,10 @@ def test_regressions_of_all_fluoroscopes_are_one_smoother():
     moved = both.without_gauge(values, interior) - values
     np.testing.assert_allclose(moved[network.rows(0)], 1.0)
     np.testing.assert_allclose(moved[rows], 30.0)
-    terms = SimpleNamespace(fitted_series=lambda f, after, precise: f'series {f}')
+    parts = [
+        SimpleNamespace(fitted_series=lambda after, precise, f=f: f'series {f}') for f in (0, 1)
+    ]
+    terms = SimpleNamespace(parts=parts)
     models = both.models(values, terms, None, None)
     np.testing.assert_array_equal(models['b'][0], values[rows])
     assert models['b'][1] == 'series 1' and both.models(values, None, None, None)['a'][1] is None

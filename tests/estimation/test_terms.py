@@ -27,7 +27,7 @@ from fluoro_calib_ros.estimation.estimator import (
 )
 from fluoro_calib_ros.estimation.exposure_terms import ExposureTerms, exposure_functions
 from fluoro_calib_ros.estimation.fluoroscope_terms import MIN_START_SD_PX, FluoroscopeTerms
-from fluoro_calib_ros.estimation.parametric import StepwiseTerms
+from fluoro_calib_ros.estimation.parametric import ExpertTerms, StepwiseTerms
 from fluoro_calib_ros.estimation.priors import Prior, covariance_of_series, prior_precision
 from fluoro_calib_ros.estimation.refinements import (
     GAP_FROM,
@@ -52,6 +52,11 @@ SIZE = (1024, 1024)
 NOISE = Noise('gaussian', 0.3)
 
 
+def zeros_of(terms):
+    """Coefficients of no correction, by fluoroscope."""
+    return tuple(np.zeros(part.count) for part in terms.parts)
+
+
 def problem_of(network, before, gauge=GaugeKind.FULL):
     count = network.n_fluoroscopes
     return AdjustmentProblem(network, [SIZE] * count, before, (gauge,) * count)
@@ -74,7 +79,7 @@ def with_own(terms, size_px=0.5):
 def solved(network, before, terms):
     """Network with the terms, its adjustment and its factorized normal matrix."""
     varying = terms.with_additional(network)
-    parameters = replace(before.parameters, additional=terms.zeros())
+    parameters = replace(before.parameters, additional=zeros_of(terms))
     after = adjust(varying, parameters, noise=NOISE)
     return (
         varying,
@@ -233,7 +238,7 @@ def test_series_of_terms_is_without_those_of_exposures_and_with_its_uncertain_te
     coefficients = after.parameters.additional[0]
     end = 2 * len(part.functions)
     assert part.of_series == slice(end) and part.count == end + part.own.count
-    found = terms.fitted_series(0, after, precise)
+    found = terms.parts[0].fitted_series(after, precise)
     uv = part.uv[:40]
     field = part.functions(uv) @ coefficients[:end].reshape(2, -1).T
     # Rings that do not exist are excluded.
@@ -246,7 +251,7 @@ def test_series_of_terms_is_without_those_of_exposures_and_with_its_uncertain_te
     sd = np.sqrt(np.trace(design @ covariance @ design.T) / 2)
     assert found.sd_at(np.array([[511.5, 511.5]]))[0] == pytest.approx(sd, rel=1e-6)
     part.prior.trend[14] = 1.0
-    assert terms.fitted_series(0, after, precise).functions.degree == 7
+    assert terms.parts[0].fitted_series(after, precise).functions.degree == 7
     with pytest.raises(ValueError, match='no terms were estimated for fluoroscope number 0'):
         part.fitted_series(after, replace(precise, additional=(None,)))
 
@@ -276,19 +281,18 @@ def test_what_terms_leave_out_is_their_signal_beyond_the_complete_sines():
     _, _, terms = case(modes=6)
     part = terms.parts[0]
     part.prior = replace(part.prior, signal=Signal(0.8, 150.0))
-    left = terms.left_out(0)
+    (left,) = part.left_out()
     highest = part.functions.highest
-    assert (
-        left.sd_px == pytest.approx(part.prior.signal.sd_beyond(highest)) and left.places is None
-    )
+    expected = part.prior.signal.sd_beyond(highest) ** 2
+    np.testing.assert_allclose(left.variance(part.uv[:2]), [expected] * 2)
     distance = np.array([0.0, 20.0, 50.0])
     np.testing.assert_allclose(
         left.correlation(distance), part.prior.signal.correlation_beyond(highest, distance)
     )
     network, before, flat = case(modes=0)
-    assert flat.left_out(0) is None
-    zeros = flat.variance_between_exposures(
-        0, network, before, SimpleNamespace(additional=(None,))
+    assert flat.parts[0].left_out() == ()
+    zeros = flat.parts[0].variance_between_exposures(
+        network, before, SimpleNamespace(additional=(None,))
     )
     assert zeros.tolist() == [0.0] * before.inliers.sum()
 
@@ -304,11 +308,11 @@ def test_variance_between_exposures_is_that_of_their_terms():
     network = replace(network, uv=uv)
     varying, after, _ = solved(network, before, terms)
     precise = precision(varying, after)
-    found = terms.variance_between_exposures(1, varying, after, precise)
+    found = terms.parts[1].variance_between_exposures(varying, after, precise)
     assert len(found) == after.inliers[part.rows].sum()
     assert 0.5 < np.mean(found) / np.mean((part.own.values @ drawn) ** 2) < 1.3
     part._angle_fit = SimpleNamespace(remaining=0.25)
-    less = terms.variance_between_exposures(1, varying, after, precise)
+    less = terms.parts[1].variance_between_exposures(varying, after, precise)
     np.testing.assert_allclose(less, 0.25 * found)
 
 
@@ -344,7 +348,7 @@ def test_a_change_of_the_terms_continues_with_the_same_correction():
     np.testing.assert_allclose(terms.parts[1].correction(coefficients[1]), fields[1], atol=1e-9)
     assert len(coefficients[1]) == terms.parts[1].count
     assert not coefficients[1][terms.parts[1].of_series.stop :].any()
-    assert terms.exposure_terms == [None, own]
+    assert [part.own for part in terms.parts] == [None, own]
 
 
 def test_terms_of_exposures_stay_where_the_series_is_given_anew():
@@ -353,7 +357,7 @@ def test_terms_of_exposures_stay_where_the_series_is_given_anew():
     part = terms.parts[0]
     functions = exposure_functions(part.uv, SIZE, part.interior)
     part.own = ExposureTerms(functions, part.exposure, 0.3)
-    terms._start = terms.zeros()
+    terms._start = zeros_of(terms)
     varying, after, matrix = solved(network, before, terms)
     present = coefficients_of(after)[0]
     given = np.arange(1.0, 1.0 + 2 * len(part.functions_with(4, part.prior)))
@@ -418,7 +422,7 @@ def plane_wave(uv, wavelength):
 
 def solution_with(terms, network, before, residuals, coefficients=None):
     """A steady solution with given residuals (N, 2) and coefficients."""
-    additional = coefficients or terms.zeros()
+    additional = coefficients or zeros_of(terms)
     q = np.sum(residuals**2, axis=1) / (0.3 * network.sigma) ** 2
     after = replace(
         before,
@@ -645,19 +649,23 @@ def test_expert_terms_of_a_distortion_are_selected():
     network = bent(network, radial_and_spiral)
     before = adjust(network, truth, noise=Noise('student_t', 0.3, 20.0))
     terms, after, converged = stepwise(network, before)
-    names = {name for name, there in zip(terms.names, terms.selected[0]) if there}
+    names = {name for name, there in zip(terms.names, terms.parts[0].selected) if there}
     assert converged and {'radial 1', 'spiral 1'} <= names and len(names) <= 4
     coefficients = after.parameters.additional[0]
-    assert not np.abs(coefficients[~terms.selected[0]]).max() > 1e-6
-    covariance = np.diag(np.where(terms.selected[0], 1e-2, 0.0))
-    series = terms.fitted_series(0, after, SimpleNamespace(additional=(covariance,)))
+    assert not np.abs(coefficients[~terms.parts[0].selected]).max() > 1e-6
+    covariance = np.diag(np.where(terms.parts[0].selected, 1e-2, 0.0))
+    series = terms.parts[0].fitted_series(after, SimpleNamespace(additional=(covariance,)))
     error = series.predict(network.uv) - radial_and_spiral(network.uv)
     flat = gauge_basis(network.uv, after.parameters.interior[0]).reshape(error.size, -1)
     left = error.ravel() - flat @ np.linalg.lstsq(flat, error.ravel(), rcond=None)[0]
     assert np.sqrt(np.mean(left**2)) < 0.06
-    drawn = np.random.default_rng(13).normal(0, 0.1, (3000, 31)) * terms.selected[0]
+    drawn = np.random.default_rng(13).normal(0, 0.1, (3000, 31)) * terms.parts[0].selected
     at = np.array([[511.5, 511.5], [255.5, 767.5]])
-    values = np.einsum('nm,pam->pna', terms.functions[0](at), terms._maps[0].reshape(31, 2, -1))
+    values = np.einsum(
+        'nm,pam->pna',
+        terms.parts[0].functions(at),
+        terms.parts[0].to_polynomials.reshape(31, 2, -1),
+    )
     scatter = np.sqrt(np.mean(np.var(np.einsum('kp,pna->kna', drawn, values), axis=0), axis=1))
     np.testing.assert_allclose(series.sd_at(at), scatter, rtol=0.05)
 
@@ -666,7 +674,7 @@ def test_terms_of_no_distortion_are_hardly_any():
     network, truth = rigs.small_network(8, 70, noise_px=0.2, seed=5)
     before = adjust(network, truth, noise=Noise('student_t', 0.3, 20.0))
     terms, _, _ = stepwise(network, before)
-    assert terms.selected[0].sum() <= 1
+    assert terms.parts[0].selected.sum() <= 1
 
 
 @pytest.mark.parametrize('gauge, count', [(GaugeKind.FULL, 31), (GaugeKind.NONE, 37)])
@@ -674,34 +682,34 @@ def test_expert_terms_are_without_the_gauge_unless_orientations_are_known(gauge,
     network, truth = rigs.small_network(4, 60)
     before = adjust(network, truth, noise=NOISE)
     terms = StepwiseTerms(problem_of(network, before, gauge))
-    values = terms.values[0]
+    values = terms.parts[0].values
     assert values.shape == (len(network.uv), 2, count) and len(terms.names) == count
     basis = gauge_basis(network.uv, before.parameters.interior[0]).reshape(values.shape[0] * 2, -1)
     part = np.linalg.lstsq(basis, values.reshape(len(basis), -1), rcond=None)[0]
     orthogonal = np.abs(part[:, :31]).max() < 1e-9
     assert orthogonal == (gauge is GaugeKind.FULL)
-    functions = terms.functions[0](network.uv)
+    functions = terms.parts[0].functions(network.uv)
     for t in (0, 7, 30):
-        matrix = terms._maps[0][t].reshape(2, -1)
+        matrix = terms.parts[0].to_polynomials[t].reshape(2, -1)
         np.testing.assert_allclose(functions @ matrix.T, values[:, :, t], atol=1e-9)
-    assert [len(c) for c in terms.zeros()] == [count]
+    assert [len(c) for c in terms.start()] == [count]
 
 
 def test_terms_that_were_not_estimated_have_no_series():
     network, truth = rigs.small_network(4, 60)
     before = adjust(network, truth, noise=NOISE)
     terms = StepwiseTerms(problem_of(network, before))
-    zero, covariance = terms.zeros()[0], np.eye(31)
+    zero, covariance = terms.start()[0], np.eye(31)
     for given, known in ((None, covariance), (zero, None)):
         after = SimpleNamespace(parameters=SimpleNamespace(additional=(given,)))
         with pytest.raises(ValueError, match='no terms were estimated for fluoroscope number 0'):
-            terms.fitted_series(0, after, SimpleNamespace(additional=(known,)))
+            terms.parts[0].fitted_series(after, SimpleNamespace(additional=(known,)))
 
 
 def expert_step(network, before, selected):
     """Terms with a selection, and the inputs of a step at their solution."""
     terms = StepwiseTerms(problem_of(network, before))
-    terms.selected[0][selected] = True
+    terms.parts[0].selected[selected] = True
     varying, after, matrix = solved(network, before, terms)
     return terms, varying, after, matrix
 
@@ -716,8 +724,8 @@ def test_a_term_that_is_not_significant_is_rejected_for_good():
     assert t[:2].min() > 10 and t[2] < 3.5
     settled, _ = terms.renew(varying, matrix, after)
     assert not settled
-    assert np.flatnonzero(terms.selected[0]).tolist() == [0, 3]
-    assert np.flatnonzero(terms._rejected[0]).tolist() == [12]
+    assert np.flatnonzero(terms.parts[0].selected).tolist() == [0, 3]
+    assert np.flatnonzero(terms.parts[0]._rejected).tolist() == [12]
 
 
 def test_the_term_with_the_largest_statistic_is_added():
@@ -727,7 +735,7 @@ def test_the_term_with_the_largest_statistic_is_added():
     before = adjust(network, truth, noise=NOISE)
     terms, varying, after, matrix = expert_step(network, before, [0])
     terms.renew(varying, matrix, after)
-    (added,) = np.setdiff1d(np.flatnonzero(terms.selected[0]), [0])
+    (added,) = np.setdiff1d(np.flatnonzero(terms.parts[0].selected), [0])
     costs = {}
     for one in (added, *(k for k in (3, 4, 12, 20) if k != added)):
         costs[one] = solved(network, before, expert_step(network, before, [0, one])[0])[1].cost
@@ -743,14 +751,14 @@ def test_change_by_a_term_is_that_of_the_adjustment_with_it(monkeypatch):
     terms, varying, after, matrix = expert_step(network, before, selected)
     tried = []
 
-    def improves(self, f, result, rows, change, t):
+    def improves(self, result, change, t):
         tried.append((change, t))
         return True
 
-    monkeypatch.setattr(StepwiseTerms, '_improves', improves)
-    monkeypatch.setattr(StepwiseTerms, '_remove_insignificant', lambda *_: False)
+    monkeypatch.setattr(ExpertTerms, '_improves', improves)
+    monkeypatch.setattr(ExpertTerms, '_remove_insignificant', lambda *_: False)
     assert not terms.renew(varying, matrix, after)[0]
-    (added,) = np.setdiff1d(np.flatnonzero(terms.selected[0]), selected)
+    (added,) = np.setdiff1d(np.flatnonzero(terms.parts[0].selected), selected)
     more = solved(network, before, expert_step(network, before, [*selected, added])[0])
     field = [one.additional_correction(r.parameters) for one, r, _ in ((varying, after, 0), more)]
     ((change, t),) = tried
@@ -774,19 +782,18 @@ def test_trend_of_residuals_is_their_product_with_those_about():
     for i, at in enumerate(network.uv):
         near = np.argsort(np.linalg.norm(network.uv - at, axis=1))[1:9]
         total += inside[i] @ inside[near].mean(axis=0)
-    assert terms._trend(0, residuals, core) == pytest.approx(total / len(residuals))
+    assert terms.parts[0]._trend(residuals, core) == pytest.approx(total / len(residuals))
 
 
 def test_a_significant_term_stays_if_it_reduces_the_rmse_or_the_trend():
     network, truth = rigs.small_network(8, 70)
     before = adjust(network, truth, noise=NOISE)
     terms = StepwiseTerms(problem_of(network, before))
-    rows = network.rows(0)
     wave = np.sin(network.uv / 100.0)
     noise = np.random.default_rng(15).normal(0, 0.3, network.uv.shape)
     after = replace(before, residuals=wave + noise)
     square = np.sum(after.q[after.inliers])
     small, large = (np.sqrt(square * (1 - (1 - part) ** 2)) for part in (0.9e-3, 1.1e-3))
-    assert terms._improves(0, after, rows, wave, small)  # reduces the trend
-    assert not terms._improves(0, after, rows, -wave, small)
-    assert terms._improves(0, after, rows, -wave, large)  # reduces the RMSE
+    assert terms.parts[0]._improves(after, wave, small)  # reduces the trend
+    assert not terms.parts[0]._improves(after, -wave, small)
+    assert terms.parts[0]._improves(after, -wave, large)  # reduces the RMSE

@@ -135,7 +135,7 @@ def test_residuals_bound_the_variance_beyond_a_series():
     points = FittedPoints(uv, noise, exposure)
 
     def smooth(sd_px):
-        return LeftOut(sd_px, np.ones_like)
+        return [LeftOut(lambda at: np.full(len(at), sd_px**2), np.ones_like)]
 
     assert np.median(sd_with_lack_of_fit(points, series, smooth(0.005))) == pytest.approx(
         0.005, rel=0.2
@@ -150,7 +150,7 @@ def test_residuals_bound_the_variance_beyond_a_series():
     found = np.median(sd_with_lack_of_fit(FittedPoints(uv, noise + waves, exposure), series))
     assert 0.7 * 0.21 < found < 1.4 * 0.21
     # Ripples that are too short for the point spacing cannot be excluded.
-    short = LeftOut(0.5, np.zeros_like)
+    short = [LeftOut(lambda at: np.full(len(at), 0.25), np.zeros_like)]
     assert np.median(sd_with_lack_of_fit(points, series, short)) == pytest.approx(0.5)
 
 

@@ -298,14 +298,14 @@ def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     return checks
 
 
-def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
+def rejected_beads(residuals: ResidualTable) -> NDArray[np.int64]:
     """Return target ids of beads most of whose image points are rejected, more than by chance.
 
     Too few rays of such a bead may agree to intersect it, while false matches are as frequent
     among its image points as among those of other beads. It is likely that all image points of one
     bead with few of them are rejected by chance; it is unlikely for several beads.
     """
-    if residuals is None or not len(residuals.target_id):
+    if not len(residuals.target_id):
         return np.zeros(0, dtype=np.int64)
     target_id, bead = np.unique(residuals.target_id, return_inverse=True)
     seen = np.bincount(bead)

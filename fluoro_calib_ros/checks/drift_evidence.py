@@ -111,14 +111,14 @@ class Evidence(ABC):
             [r.systematic[series, area] * r.information[series, area] for r in run]
         )
         total = information[series, area]
-        direction, source, confirmed = self._direction(run, series, area)
+        direction, against, source, confirmed = self._described(run, series, area)
         return DriftEstimate(
             names,
             area,
             size=float(size[series, area]),
             sd=float(np.hypot(np.sqrt(factor / total), systematic / total)),
             direction=direction,
-            against=self._reference(series),
+            against=against,
             source=source,
             confirmed=confirmed,
             begin_ns=begin,
@@ -147,9 +147,9 @@ class Evidence(ABC):
         names = tuple(name for name in order if candidates[name].likelihood >= limit)
         return names, best.series, best.area
 
-    @abstractmethod
     def _preferred(self, likelihood: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the likelihood (2, K, A), with -1 for series to which others are preferred."""
+        return likelihood
 
     @abstractmethod
     def _likeliest(
@@ -161,14 +161,10 @@ class Evidence(ABC):
         """
 
     @abstractmethod
-    def _direction(
+    def _described(
         self, run: list[BlockRecord], series: int, area: int
-    ) -> tuple[NDArray[np.float64], str, bool]:
-        """Return direction (2,) of a drift, its source, and whether it is confirmed."""
-
-    @abstractmethod
-    def _reference(self, series: int) -> str:
-        """Return one of REFERENCES."""
+    ) -> tuple[NDArray[np.float64], str, str, bool]:
+        """Return direction (2,) of a drift, one of REFERENCES, source, and whether confirmed."""
 
 
 class EpipolarEvidence(Evidence):
@@ -202,15 +198,13 @@ class EpipolarEvidence(Evidence):
             candidates[name] = _Candidate(float(total[area]), best, area)
         return self._ranked(candidates)
 
-    def _direction(
+    def _described(
         self, run: list[BlockRecord], series: int, area: int
-    ) -> tuple[NDArray[np.float64], str, bool]:
-        pair = series // SERIES_OF_PAIR
+    ) -> tuple[NDArray[np.float64], str, str, bool]:
+        pair, of_pair = divmod(series, SERIES_OF_PAIR)
         normal = sum(record.detail[pair, series % 2, area] for record in run)
-        return normal / max(np.linalg.norm(normal), MIN_INFORMATION), EPIPOLAR, True
-
-    def _reference(self, series: int) -> str:
-        return REFERENCES[series % SERIES_OF_PAIR // 2]
+        direction = normal / max(np.linalg.norm(normal), MIN_INFORMATION)
+        return direction, REFERENCES[of_pair // 2], EPIPOLAR, True
 
 
 class BodyEvidence(Evidence):
@@ -229,9 +223,6 @@ class BodyEvidence(Evidence):
         super().__init__(charts, fluoroscopes, window)
         self._bodies = tuple(bodies)
 
-    def _preferred(self, likelihood: NDArray[np.float64]) -> NDArray[np.float64]:
-        return likelihood
-
     def _likeliest(
         self, likelihood: NDArray[np.float64], series: int
     ) -> tuple[tuple[str, ...], int, int]:
@@ -244,9 +235,9 @@ class BodyEvidence(Evidence):
             candidates[name] = _Candidate(value, int(first + component), int(area))
         return self._ranked(candidates)
 
-    def _direction(
+    def _described(
         self, run: list[BlockRecord], series: int, area: int
-    ) -> tuple[NDArray[np.float64], str, bool]:
+    ) -> tuple[NDArray[np.float64], str, str, bool]:
         score = sum(record.detail.score[:, series, area] for record in run)
         information = sum(record.detail.information[:, series, area] for record in run)
         sign = np.sign(score.sum())
@@ -257,7 +248,4 @@ class BodyEvidence(Evidence):
         noise = np.sqrt(max(information[other_bodies].sum() * factor, MIN_INFORMATION))
         confirmed = bool(sign * score[other_bodies].sum() / noise > SURE)
         source = f'cluster {self._bodies[strongest]}'
-        return np.eye(COMPONENTS)[series % COMPONENTS], source, confirmed
-
-    def _reference(self, series: int) -> str:
-        return 'start'
+        return np.eye(COMPONENTS)[series % COMPONENTS], 'start', source, confirmed

@@ -59,7 +59,7 @@ from .drift_evidence import (
     DriftEstimate,
     EpipolarEvidence,
 )
-from .pair_watch import PairWatch
+from .pair_watch import PairBlock, PairWatch
 
 BODY_STEP = 2.0  # multiple of step_px for the charts of bodies, which have less information
 HYSTERESIS = 0.5  # multiple of the threshold of WARN below which an alarm ends
@@ -183,30 +183,24 @@ class DriftWatch:
     def _close_residuals(self, begin_ns: int) -> bool:
         """Update the charts of the residuals; return whether a drift could be detected."""
         options = self.options
-        shape = (SERIES_OF_PAIR * len(self._pairs), len(self._areas))
-        score, information, systematic = np.zeros((3, *shape))
-        normals = np.zeros((len(self._pairs), 2, shape[1], 2))
-        record = BlockRecord(begin_ns, score, information, systematic, normals)
-        testing = np.zeros(shape, dtype=bool)
+        blocks = []
         seen = []
         for number, collected in enumerate(self._collected):
-            if not collected:
-                continue
             self._collected[number] = []
-            observations = joined_rows(collected).usable()
-            if not len(observations):
+            observations = joined_rows(collected).usable() if collected else None
+            if observations is None or not len(observations):
+                blocks.append(PairBlock.empty(len(self._areas)))
                 continue
-            block = self._watches[number].block(observations)
-            rows = slice(SERIES_OF_PAIR * number, SERIES_OF_PAIR * (number + 1))
+            blocks.append(self._watches[number].block(observations))
             seen.append(number)
             self._observations += len(observations)
-            record.score[rows] = block.score
-            record.information[rows] = block.information
-            record.systematic[rows] = block.systematic
-            record.detail[number] = block.normals
-            testing[rows] = block.enough & self._has_learned(self._learned_blocks[number])
         if not seen:
             return False
+        block = joined_rows(blocks)
+        normals = np.stack([pair_block.normals for pair_block in blocks])
+        record = BlockRecord(begin_ns, block.score, block.information, block.systematic, normals)
+        learned = [self._has_learned(count) for count in self._learned_blocks]
+        testing = block.enough & np.repeat(learned, SERIES_OF_PAIR)[:, None]
         stretch = np.array([watch.stretch() for watch in self._watches])
         self._epipolar.charts.stretch[:, 0] = np.repeat(stretch, SERIES_OF_PAIR)
         self._bodies.charts.stretch[:] = stretch.max()

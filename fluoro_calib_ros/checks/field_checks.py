@@ -71,8 +71,6 @@ def _precision(evidence: Evidence, name: str) -> Check:
 def _redundancy(evidence: Evidence, name: str) -> float:
     """Return the mean redundancy number of the inliers, which relates residuals to noise."""
     table = evidence.result.residuals
-    if table is None:
-        return 1.0
     return float(np.mean(table.redundancy[(table.fluoroscope == name) & ~table.outlier]))
 
 

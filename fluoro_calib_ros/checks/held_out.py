@@ -38,24 +38,16 @@ def misfits(
 ) -> dict[str, float]:
     """Return the ratio of residuals and noise of fluoroscopes that their calibration misfits."""
     ratios = {
-        name: _lack_of_fit(result.residuals, calibrations[name], (name, frames[name]))
+        name: _lack_of_fit(result.residuals, calibrations[name], name, frames[name])
         for name in result.fluoroscopes
     }
     return {name: ratio for name, ratio in ratios.items() if ratio > MAX_NOISE}
 
 
 def _lack_of_fit(
-    table: ResidualTable | None,
-    calibration: FluoroscopeCalibration,
-    seen: tuple[str, Sequence[Frame]],
+    table: ResidualTable, calibration: FluoroscopeCalibration, name: str, frames: Sequence[Frame]
 ) -> float:
-    """Return the RMSE of image points that are not false matches, over their noise.
-
-    seen: a fluoroscope and its frames. Returns NaN if residuals were not stored.
-    """
-    if table is None:
-        return float('nan')
-    name, frames = seen
+    """Return the RMSE of image points that are not false matches, over their noise."""
     ratios = []
     for frame in frames:
         rows = (table.fluoroscope == name) & (table.exposure == frame.number) & ~table.outlier

@@ -45,8 +45,8 @@ BETTER = 0.35  # maximum ratio of median residuals with other and given ids to a
 MAX_COORDINATE_MM = 1e6  # a kilometre
 EXTENT_SHARE = 0.9  # share of the targets within the extent of the phantom
 MAX_EXTENT = 6.0  # maximum distance of a target from the middle, over that extent
-SD_MM = (1e-6, 1e3)  # plausible range for surveyed coordinates
-SIGMA_PX = (1e-4, 1e3)  # plausible range for image points
+# Plausible standard deviations of surveyed coordinates, and of image points.
+PLAUSIBLE = {'sd_mm': (1e-6, 1e3), 'sigma_px': (1e-4, 1e3)}
 MIN_REACH = 0.6  # minimum extent of the image points over the image size, to the right and down
 MARGIN = 0.03  # share of an image without image points that says nothing about its size
 MIN_SHARE = 0.5  # minimum share of the ids that exist on the phantom
@@ -118,24 +118,40 @@ def validate_magnitudes(frames: Frames, phantom: Phantom) -> None:
             kind=Kind.IMPLAUSIBLE_NUMBER,
             place=replace(_PHANTOM, target_id=(target,)),
         )
-    low, high = SD_MM
-    is_wrong = (phantom.sd_mm < low) | (phantom.sd_mm > high)
-    if is_wrong.any():
-        target = int(phantom.target_id[is_wrong][0])
-        sd = float(phantom.sd_mm[is_wrong][0])
-        raise DataError(
-            f'the standard deviation of target {target} is {sd:g} mm, between {low:g} and '
-            f'{high:g} mm are plausible',
-            kind=Kind.IMPLAUSIBLE_NUMBER,
-            place=replace(_PHANTOM, target_id=(target,)),
-            numbers={'sd_mm': sd},
-        )
+    _require_plausible(
+        'sd_mm', 'the standard deviation', phantom.sd_mm, phantom.target_id, _PHANTOM
+    )
     if np.ptp(phantom.xyz_mm, axis=0).max() <= 0:
         raise DataError(
             'all targets have the same coordinates', kind=Kind.REPEATED_COORDINATES, place=_PHANTOM
         )
     for frame in (frame for exposures in frames.values() for frame in exposures):
-        _validate_sigma(frame)
+        if frame.sigma is not None:
+            sigma, ids = np.asarray(frame.sigma), np.asarray(frame.target_id)
+            _require_plausible('sigma_px', 'sigma', sigma, ids, frame.place)
+
+
+def _require_plausible(
+    number: str,
+    name: str,
+    values: NDArray[np.float64],
+    target_id: NDArray[np.int64],
+    place: Place,
+) -> None:
+    """Raise DataError if values (n,) of targets (n,) are not plausible; number: see PLAUSIBLE."""
+    low, high = PLAUSIBLE[number]
+    unit = number.rpartition('_')[2]
+    is_wrong = (values < low) | (values > high)
+    if is_wrong.any():
+        target = int(target_id[is_wrong][0])
+        value = float(values[is_wrong][0])
+        raise DataError(
+            f'{name} of target {target} is {value:g} {unit}, between {low:g} and {high:g} '
+            f'{unit} are plausible',
+            kind=Kind.IMPLAUSIBLE_NUMBER,
+            place=replace(place, target_id=(target,)),
+            numbers={number: value},
+        )
 
 
 def validate_names(names: Iterable[str]) -> None:
@@ -206,23 +222,6 @@ def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
     return out
 
 
-def _validate_sigma(frame: Frame) -> None:
-    if frame.sigma is None:
-        return
-    low, high = SIGMA_PX
-    sigma = np.asarray(frame.sigma)
-    is_wrong = (sigma < low) | (sigma > high)
-    if is_wrong.any():
-        target = int(np.asarray(frame.target_id)[is_wrong][0])
-        raise DataError(
-            f'sigma of target {target} is {sigma[is_wrong][0]:g} px, between {low:g} and '
-            f'{high:g} px are plausible',
-            kind=Kind.IMPLAUSIBLE_NUMBER,
-            place=replace(frame.place, target_id=(target,)),
-            numbers={'sigma_px': float(sigma[is_wrong][0])},
-        )
-
-
 def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: NDArray[np.int64]) -> Fit | None:
     """Fit an exposure, using target_id (n,) as its ids, to the phantom.
 
@@ -234,13 +233,14 @@ def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: NDArray[np.int64])
         return None
     xyz = phantom.xyz_mm[rows[on_phantom]]
     uv = np.asarray(frame.uv, dtype=float)[on_phantom]
-    if flatness(xyz) < MIN_FLATNESS:
-        return _fit_of_plane(xyz, uv)
     try:
         with np.errstate(all='ignore'):
+            if flatness(xyz) < MIN_FLATNESS:
+                xy = plane_of(xyz).coordinates(xyz)
+                squared = squared_residuals(robust_dlt(xy, uv), xy, uv)
+                return Fit(float(np.sqrt(np.median(squared))), False, None)
             projection = robust_dlt(xyz, uv)
-            image = xyz @ projection[:, :3].T + projection[:, 3]
-            residual = np.linalg.norm(image[:, :2] / image[:, 2:] - uv, axis=1)
+            residual = np.sqrt(squared_residuals(projection, xyz, uv))
             _, rotation, source = decompose(projection)
     except (DataError, np.linalg.LinAlgError):
         return None
@@ -249,17 +249,6 @@ def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: NDArray[np.int64])
         return None
     distance = float(np.linalg.norm(source - xyz.mean(axis=0)))
     return Fit(float(np.median(residual)), bool(np.median(depth) < 0), distance)
-
-
-def _fit_of_plane(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> Fit | None:
-    """Fit image points (n, 2) to targets (n, 3) in one plane."""
-    try:
-        with np.errstate(all='ignore'):
-            xy = plane_of(xyz).coordinates(xyz)
-            squared = squared_residuals(robust_dlt(xy, uv), xy, uv)
-    except (DataError, np.linalg.LinAlgError):
-        return None
-    return Fit(float(np.sqrt(np.median(squared))), False, None)
 
 
 def find_wrong_input(frames: Frames, phantom: Phantom) -> list[Finding]:

@@ -32,7 +32,6 @@ from ..estimation.lack_of_fit import (
     areas_of_rejected,
 )
 from ..estimation.result import CalibrationResult
-from ..estimation.rounds import ResidualTable
 from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.decisions import Doubtful
 from ..exposures.frame import Frame, angles_of, cells_of
@@ -176,29 +175,17 @@ def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> 
 
     job: adjustment with the calibrations fixed. name: name of the fluoroscope.
     """
-    figures = job.fluoroscopes[name]
-    calibration = job.calibrations[name]
-    targets = job.targets
-    by_number = {frame.number: frame.sorted() for frame in frames}
-    uv = []
-    residuals = []
-    ids = []
-    for exposure in figures.exposures:
-        frame = by_number[exposure.exposure]
-        points = targets.xyz_mm[np.searchsorted(targets.target_id, frame.target_id)]
-        rotation = matrix_from_quaternion(exposure.quaternion_wxyz)
-        ideal = project(rotation, exposure.position_mm, points, figures.interior)
-        uv.append(frame.uv)
-        correction = calibration.correction(frame.uv, frame.angle).duv
-        residuals.append(frame.uv - correction - ideal)
-        ids.append(frame.target_id)
+    table = job.residuals
+    rows = np.flatnonzero(table.fluoroscope == name)
+    numbers = np.array([e.exposure for e in job.fluoroscopes[name].exposures])
+    by_number = {frame.number: frame for frame in frames}
     return Residuals(
-        np.concatenate(uv),
-        np.concatenate(residuals),
-        exposure=np.repeat(np.arange(len(uv)), [len(part) for part in uv]),
-        target_id=np.concatenate(ids),
-        numbers=np.array([e.exposure for e in figures.exposures]),
-        angles=angles_of(by_number[e.exposure] for e in figures.exposures),
+        table.uv[rows],
+        table.residual[rows],
+        exposure=np.searchsorted(numbers, table.exposure[rows]),
+        target_id=table.target_id[rows],
+        numbers=numbers,
+        angles=angles_of(by_number[number] for number in numbers.tolist()),
     )
 
 
@@ -467,9 +454,7 @@ def doubtful_observations(
     failed = [c for c in checks if c.kind is Kind.EXPOSURES and c.passed is False]
     excluded = [f for f in result.findings if f.severity is Severity.NOTE and f.kind in BAD]
     out = [doubtful for finding in (*failed, *excluded) for doubtful in _of_finding(finding)]
-    if result.residuals is not None:
-        out += _outlying_points(result, result.residuals)
-    return out
+    return [*out, *_outlying_points(result)]
 
 
 def _of_finding(finding: Finding) -> Iterator[Doubtful]:
@@ -480,8 +465,9 @@ def _of_finding(finding: Finding) -> Iterator[Doubtful]:
                 yield Doubtful(name, exposure, exposure, target, finding.cause)
 
 
-def _outlying_points(result: CalibrationResult, table: ResidualTable) -> Iterator[Doubtful]:
+def _outlying_points(result: CalibrationResult) -> Iterator[Doubtful]:
     """Yield the image points that fail their test, with other targets that they may show."""
+    table = result.residuals
 
     def of_exposure(point: Mapping[str, Any]) -> tuple[str, int]:
         return point['fluoroscope'], point['exposure']
@@ -496,7 +482,7 @@ def _outlying_points(result: CalibrationResult, table: ResidualTable) -> Iterato
         failed = [tests[target] for target in table.target_id[rows].tolist()]
         sd = np.sqrt([point['value'] for point in failed])
         limit = np.sqrt([point['critical'] for point in failed])
-        candidates = _may_be(result, table, in_exposure, rows, lengths * limit / sd)
+        candidates = _may_be(result, in_exposure, rows, lengths * limit / sd)
         for k, row in enumerate(rows):
             yield Doubtful(
                 name,
@@ -513,7 +499,6 @@ def _outlying_points(result: CalibrationResult, table: ResidualTable) -> Iterato
 
 def _may_be(
     result: CalibrationResult,
-    table: ResidualTable,
     here: NDArray[np.bool_],
     rows: NDArray[np.intp],
     limit_px: NDArray[np.float64],
@@ -524,6 +509,7 @@ def _may_be(
     own image points are excluded, and each target is only proposed for the image point nearest to
     it. limit_px (k,): of residuals; at other targets they have about the same standard deviation.
     """
+    table = result.residuals
     name = str(table.fluoroscope[rows[0]])
     figures = result.fluoroscopes[name]
     pose = next(e for e in figures.exposures if e.exposure == table.exposure[rows[0]])

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -132,11 +133,13 @@ def calibrate_request(
             start = time.perf_counter()
             label = '+'.join(group)
             group_frames = {name: request.frames[name] for name in group}
-            run = _calibrated_group(request, group_frames, _progress_of(label, progress), starts)
+            report = None if progress is None else partial(progress, label)
+            run = _calibrated_group(request, group_frames, report, starts)
             seconds = time.perf_counter() - start
             runs[label] = run
             figures |= _figures_of_run(run)
-            calibrations |= _calibrations_of_run(run, group_frames, request.phantom, seconds)
+            noise = {name: _image_noise(run, f, name) for f, name in enumerate(group)}
+            calibrations |= _calibrations_of_run(run, request, seconds, noise)
         relative = [
             relative_orientations(run, options.relative_orientation) for run in runs.values()
         ]
@@ -189,12 +192,11 @@ def calibrate_part(
             frames = {name: request.frames[name] for name in group}
             run = _calibrated_group(request, frames, None, starts)
             seconds = time.perf_counter() - start
-            for f, name in enumerate(run.measured.fluoroscopes):
-                digest = digest_of_sources(frames[name], request.phantom)
-                noise = _ImageNoise(earlier[name].image_sd, earlier[name].noise_profile)
-                out[name] = _calibration(
-                    run, f, name=name, digest=digest, seconds=seconds, noise=noise
-                )
+            noise = {
+                name: _ImageNoise(earlier[name].image_sd, earlier[name].noise_profile)
+                for name in group
+            }
+            out |= _calibrations_of_run(run, request, seconds, noise)
     return out
 
 
@@ -219,17 +221,23 @@ def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
 
 
 def _calibrations_of_run(
-    run: SelfCalibration, frames: Frames, phantom: Phantom, seconds: float
+    run: SelfCalibration,
+    request: CalibrationRequest,
+    seconds: float,
+    noise: Mapping[str, _ImageNoise],
 ) -> dict[str, FluoroscopeCalibration]:
-    """Return the calibrations of the fluoroscopes of a self-calibration that took `seconds`."""
+    """Return the calibrations of the fluoroscopes of a self-calibration that took `seconds`.
+
+    noise: image noise by fluoroscope.
+    """
     return {
         name: _calibration(
             run,
             f,
             name=name,
-            digest=digest_of_sources(frames[name], phantom),
+            digest=digest_of_sources(request.frames[name], request.phantom),
             seconds=seconds,
-            noise=_image_noise(run, f, name),
+            noise=noise[name],
         )
         for f, name in enumerate(run.measured.fluoroscopes)
     }
@@ -281,15 +289,6 @@ def _require_compatible(request: CalibrationRequest) -> None:
         raise ValueError(
             'known orientations exclude a relative orientation constraint and a free network'
         )
-
-
-def _progress_of(
-    label: str, progress: Callable[[str, Round], None] | None
-) -> Callable[[Round], None] | None:
-    """Return a callback that reports rounds under a label; None: nothing is to be reported."""
-    if progress is None:
-        return None
-    return lambda current: progress(label, current)
 
 
 def _outliers_of_all(runs: Iterable[SelfCalibration]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:

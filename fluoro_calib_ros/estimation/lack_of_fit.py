@@ -24,7 +24,7 @@ Models", 1989, 10.3).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ from ..correction.series import Series, sd_grid_pixels
 from ..exposures.collector import MIN_EXPOSURES
 from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.outliers import CONTRADICTION, FALSE_ALARM
+from ..rows import chosen_rows
 
 NEIGHBOURS = 5  # nearest neighbours of an image point; those of its own exposure are ignored
 POINTS = 60  # image points about a node of the grid
@@ -311,15 +312,9 @@ def _variance_left_out(
     inside = expected > PLACE * np.max(expected, initial=0.0)
     if not inside.any():
         return left_out.variance(pixels)
-    selected = replace(
-        products,
-        **{
-            name: getattr(products, name)[inside]
-            for name in ('uv', 'value', 'shown', 'exposure', 'distance')
-        },
-    )
     mean = float(np.mean(expected[inside]))
-    variance = _variance_beyond(selected, series, mean, left_out.correlation)
+    shown = chosen_rows(products, inside)
+    variance = _variance_beyond(shown, series, mean, left_out.correlation)
     return variance / mean * left_out.variance(pixels)
 
 

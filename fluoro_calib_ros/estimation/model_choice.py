@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -201,21 +201,13 @@ def _held_out(
 
     prior: (2m, 2m) precision of the coefficients, those of u first. weight, fold: (N,).
     """
-    out = np.empty_like(values)
+
+    def solve(gram: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+        factor = cho_factor(prior + block_diag(gram, gram), lower=True, overwrite_a=True)
+        return cho_solve(factor, right.T.ravel()).reshape(2, -1).T
+
     root = np.sqrt(weight)[:, None]
-    scaled = root * functions
-    observed = root * values
-    folds = [np.flatnonzero(fold == number) for number in np.unique(fold)]
-    grams = [scaled[rows].T @ scaled[rows] for rows in folds]
-    rights = [scaled[rows].T @ observed[rows] for rows in folds]
-    gram = np.sum(grams, axis=0)
-    right = np.sum(rights, axis=0)
-    for rows, held_out_gram, held_out_right in zip(folds, grams, rights):
-        fitted = gram - held_out_gram
-        factor = cho_factor(prior + block_diag(fitted, fitted), lower=True, overwrite_a=True)
-        coefficients = cho_solve(factor, (right - held_out_right).T.ravel())
-        out[rows] = functions[rows] @ coefficients.reshape(2, -1).T
-    return out
+    return _by_other_folds(root * functions, root * values, fold, solve) / root
 
 
 def _held_out_of_terms(
@@ -228,20 +220,34 @@ def _held_out_of_terms(
 
     weight, fold (N,).
     """
-    out = np.empty_like(values)
     root = np.sqrt(weight)[:, None]
     scaled = terms * root[:, :, None]
     scaled = scaled / np.sqrt(np.sum(scaled**2, axis=(0, 1)))
-    right = values * root
+    predicted = _by_other_folds(
+        scaled.reshape(-1, terms.shape[2]),
+        (root * values).ravel(),
+        np.repeat(fold, 2),
+        lambda gram, right: np.linalg.lstsq(gram, right, rcond=1e-12)[0],
+    )
+    return predicted.reshape(-1, 2) / root
+
+
+def _by_other_folds(
+    design: NDArray[np.float64],
+    observed: NDArray[np.float64],
+    fold: NDArray[np.int64],
+    solve: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Predict observations (n, ...) by a design (n, p) fitted to the other folds (n,).
+
+    solve: returns coefficients (p, ...) of normal equations (p, p), (p, ...).
+    """
     folds = [np.flatnonzero(fold == number) for number in np.unique(fold)]
-    parts = [scaled[rows].reshape(-1, terms.shape[2]) for rows in folds]
-    grams = [part.T @ part for part in parts]
-    rights = [part.T @ right[rows].ravel() for part, rows in zip(parts, folds)]
+    grams = [design[rows].T @ design[rows] for rows in folds]
+    rights = [design[rows].T @ observed[rows] for rows in folds]
     gram = np.sum(grams, axis=0)
-    total_right = np.sum(rights, axis=0)
-    for rows, part, held_out_gram, held_out_right in zip(folds, parts, grams, rights):
-        coefficients = np.linalg.lstsq(
-            gram - held_out_gram, total_right - held_out_right, rcond=1e-12
-        )[0]
-        out[rows] = (part @ coefficients).reshape(-1, 2) / root[rows]
+    right = np.sum(rights, axis=0)
+    out = np.empty_like(observed)
+    for rows, held_out_gram, held_out_right in zip(folds, grams, rights):
+        out[rows] = design[rows] @ solve(gram - held_out_gram, right - held_out_right)
     return out

@@ -87,6 +87,8 @@ class CalibrationResult:
         ERROR: why the calibration cannot be right, although it was forced.
     converged : bool
     seconds : float
+    residuals : ResidualTable
+        Of all image points.
     relative : tuple of RelativeOrientation
         Of every other fluoroscope to the first, if they were adjusted together.
     outliers : (tuple, tuple)
@@ -95,8 +97,6 @@ class CalibrationResult:
         Correlations above 0.95 between unknowns.
     statistics : tuple of AdjustmentStatistics
         Of each adjustment.
-    residuals : ResidualTable or None
-        Of all image points; None if they were not kept.
     created : str
         Date and time of the end (UTC, ISO 8601).
     solved : dict of str to SolvedNetwork
@@ -113,11 +113,11 @@ class CalibrationResult:
     findings: tuple[Finding, ...]
     converged: bool
     seconds: float
+    residuals: ResidualTable
     relative: tuple[RelativeOrientation, ...] = ()
     outliers: tuple[tuple[Any, ...], tuple[Any, ...]] = ((), ())
     correlations: tuple[tuple[str, str, float], ...] = ()
     statistics: tuple[AdjustmentStatistics, ...] = ()
-    residuals: ResidualTable | None = None
     created: str = ''
     solved: dict[str, SolvedNetwork] = field(default_factory=dict)
 

@@ -198,26 +198,14 @@ def _continued(
         converged=False,
         exposure=network.exposure,
     )
-    problem = AdjustmentProblem(
-        network, measured.image_size, start, gauges_of(measured, options), measured.angles
-    )
     names = measured.fluoroscopes
-    terms = CollocationTerms(
-        problem,
-        earlier=EarlierTerms(
-            [earlier.series[name] for name in names],
-            [earlier.priors.get(name) for name in names],
-            not earlier.varying.isdisjoint(names),
-        ),
+    earlier_terms = EarlierTerms(
+        [earlier.series[name] for name in names],
+        [earlier.priors.get(name) for name in names],
+        not earlier.varying.isdisjoint(names),
     )
-    run = calibrate_by_adjustment(
-        measured,
-        start,
-        model_type=CollocationModel,
-        terms=terms,
-        max_rounds=options.max_iterations,
-        progress=progress,
-    )
+    job = _Job(measured, start, gauges_of(measured, options), options)
+    run, terms = job.by_collocation(progress, earlier_terms)
     earlier.priors.update(zip(names, terms.priors))
     return run
 
@@ -257,10 +245,10 @@ class _Job:
         )
 
     def by_collocation(
-        self, progress: Callable[[Round], None] | None
+        self, progress: Callable[[Round], None] | None, earlier: EarlierTerms | None = None
     ) -> tuple[SelfCalibration, CollocationTerms]:
         """Self-calibrate with collocation; return its terms too."""
-        terms = CollocationTerms(self.problem)
+        terms = CollocationTerms(self.problem, earlier=earlier)
         return self._by_terms(estimator_of(START_MODEL), terms, progress), terms
 
     def _by_terms(

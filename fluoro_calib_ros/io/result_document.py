@@ -323,9 +323,8 @@ def result_tables(result: CalibrationResult) -> dict[str, Table]:
         EXPOSURES: (_EXPOSURES_HEADER, _exposures(result)),
         TARGETS: (_TARGETS_HEADER, _targets(result)),
         INTERIOR: (_INTERIOR_HEADER, _interior(result)),
+        RESIDUALS: (_RESIDUALS_HEADER, _residuals(result.residuals)),
     }
-    if result.residuals is not None:
-        tables[RESIDUALS] = (_RESIDUALS_HEADER, _residuals(result.residuals))
     return {name: Table(tuple(header.split(',')), rows) for name, (header, rows) in tables.items()}
 
 
@@ -351,10 +350,8 @@ def _exposures(result: CalibrationResult) -> Iterator[Sequence[Any]]:
             ]
 
 
-def _fit_of_exposure(table: ResidualTable | None, name: str, exposure: int) -> list[Any]:
-    """Return image points, outliers and RMSE [px] of the inliers; blanks without a table."""
-    if table is None:
-        return ['', '', '', '']
+def _fit_of_exposure(table: ResidualTable, name: str, exposure: int) -> list[Any]:
+    """Return image points, outliers and RMSE [px] of the inliers."""
     in_exposure = (table.fluoroscope == name) & (table.exposure == exposure)
     is_inlier = in_exposure & ~table.outlier
     rmse = (
@@ -370,10 +367,8 @@ def _targets(result: CalibrationResult) -> Iterator[Sequence[Any]]:
     sd = np.sqrt(np.diagonal(targets.covariance, axis1=1, axis2=2))
     table = result.residuals
     for target, xyz, target_sd in zip(targets.target_id, targets.xyz_mm, sd):
-        counts: list[Any] = ['', '']
-        if table is not None:
-            of_target = table.target_id == target
-            counts = [int(of_target.sum()), int((of_target & table.outlier).sum())]
+        of_target = table.target_id == target
+        counts = [int(of_target.sum()), int((of_target & table.outlier).sum())]
         yield [int(target), *xyz.tolist(), *target_sd.tolist(), *counts]
 
 

@@ -461,7 +461,7 @@ def test_a_drift_is_confirmed_by_the_other_bodies(scores, source, confirmed):
     score[:, 3, 1] = np.array(scores) / 2
     information = np.full((3, 4, 2), 12.5)
     run = [Fake(detail=Fake(score=score, information=information))] * 2
-    direction, told, is_confirmed = found._direction(run, 3, 1)
+    direction, _, told, is_confirmed = found._described(run, 3, 1)
     assert direction.tolist() == [0, 1] and told == source and is_confirmed is confirmed
 
 

@@ -263,10 +263,6 @@ def test_image_points_that_fail_may_be_targets_that_nothing_else_is():
     pose = {'quaternion_wxyz': quaternion_from_matrix(rotation), 'position_mm': position}
     other = {'quaternion_wxyz': np.array([1.0, 0, 0, 0]), 'position_mm': position}
     exposures = [Fake(exposure=2, **other), Fake(exposure=5, **pose), Fake(exposure=9, **other)]
-    result = Fake(
-        fluoroscopes={'a': Fake(exposures=exposures, interior=interior)},
-        targets=Fake(target_id=ids, xyz_mm=xyz),
-    )
     table = Fake(
         fluoroscope=np.array(['a'] * 4),
         exposure=np.full(4, 5),
@@ -274,13 +270,18 @@ def test_image_points_that_fail_may_be_targets_that_nothing_else_is():
         uv=uv,
         correction=correction,
     )
+    result = Fake(
+        fluoroscopes={'a': Fake(exposures=exposures, interior=interior)},
+        targets=Fake(target_id=ids, xyz_mm=xyz),
+        residuals=table,
+    )
     here, rows = np.ones(4, bool), np.array([2, 3])
-    found = _may_be(result, table, here, rows, np.array([20.0, 20.0]))
+    found = _may_be(result, here, rows, np.array([20.0, 20.0]))
     # Target 24 is next to 23, which is assigned to the other failing point.
     assert found == [(23, 24), (26,)]
-    assert _may_be(result, table, here, rows, np.array([2.0, 0.2])) == [(23,), ()]
+    assert _may_be(result, here, rows, np.array([2.0, 0.2])) == [(23,), ()]
     table.target_id = np.array([20, 23, 22, 26])  # 23 fits elsewhere, and 26 has its own id
-    assert _may_be(result, table, here, rows, np.array([20.0, 20.0])) == [(24,), ()]
-    few = Fake(fluoroscopes=result.fluoroscopes, targets=Fake(target_id=ids[:2], xyz_mm=xyz[:2]))
+    assert _may_be(result, here, rows, np.array([20.0, 20.0])) == [(24,), ()]
+    few = Fake(**{**vars(result), 'targets': Fake(target_id=ids[:2], xyz_mm=xyz[:2])})
     table.target_id = given
-    assert _may_be(few, table, here, rows, np.array([20.0, 20.0])) == [(), ()]
+    assert _may_be(few, here, rows, np.array([20.0, 20.0])) == [(), ()]

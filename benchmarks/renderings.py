@@ -256,6 +256,8 @@ ROWS: dict[str, Row] = {
     'cube-36 plates': Row(cube(36), plates=5),
     'frame-503 plates': Row(frame(503), photons=4000.0, faces=70.0, tilt_deg=12.0),
     'cube-36 bone': Row(cube(36), bone=True),
+    'cube-36 unsharp plates': Row(cube(36), unsharp=1.5, plates=5),
+    'cube-36 unsharp bone': Row(cube(36), unsharp=1.5, bone=True),
     'cube-48 three sizes': Row(three_sizes(48), told=True),
     'cube-48 three sizes untold': Row(three_sizes(48)),
     'grid of beads': Row(sheet(20, 5.0, False, 2), tilt_deg=15.0),

@@ -108,8 +108,8 @@ class Background:
         # The gradient is (u0 + 2 u1 x + 2 u2 y, ...); x^2 and y^2 have a mean of 1/4 in a circle.
         return np.asarray(0.5 * np.arctan2(2 * (u * v).sum(axis=0), (u * u - v * v).sum(axis=0)))
 
-    def drawn(self, place: NDArray[np.float64], variance_px2: float) -> NDArray[np.float64]:
-        """Return how far (n, 2) a blur draws shadows towards less light [px], as a shift back.
+    def slope(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the relative slopes (n, 2) of the direct light at centres [1/px].
 
         place: (n, 2), centres relative to the middle of their windows [px]. If direct light is
         proportional to exp(g x), a shadow that a Gaussian of variance s^2 blurs with it appears at
@@ -118,4 +118,4 @@ class Background:
         x, y = place.T / self.window_px
         _, by_x, by_y, by_xx, by_xy, by_yy = self.terms.T
         gradient = by_x + 2 * by_xx * x + by_xy * y, by_y + by_xy * x + 2 * by_yy * y
-        return np.column_stack(gradient) * (variance_px2 / self.window_px)
+        return np.column_stack(gradient) / self.window_px

@@ -76,10 +76,22 @@ class Profile:
         wider = float(np.sqrt(variance + self.mask_px**2))
         return (1 + self.sharpening, plain), (-self.sharpening, wider)
 
-    @property
-    def variance_px2(self) -> float:
-        """Variance of the blur [px^2]."""
-        return sum(weight * sigma**2 for weight, sigma in self.blurs)
+    @cached_property
+    def drawn_px2(self) -> tuple[float, float]:
+        """How far blur and mask draw a shadow towards less light, per relative slope of the light.
+
+        A Gaussian shifts what it blurs by its variance [px^2], see `Background.slope`. That of a
+        mask shifts only its part of the shadow: the shift of the whole is the projection of that
+        part's change on the derivative of the shadow.
+        """
+        tables = _tables_of_blurs(self)
+        by_distance = sum(tables)[1]
+        variance = self.blurs[0][1] ** 2
+        change = sum(
+            (sigma**2 - variance) * table[1] for (_, sigma), table in zip(self.blurs, tables)
+        )
+        weight = np.arange(len(by_distance)) * by_distance
+        return variance, float(weight @ change / (weight @ by_distance))
 
     @cached_property
     def border_px(self) -> float:
@@ -130,7 +142,7 @@ class Shadows:
     """Tables of the shadows of beads of one or several profiles."""
 
     def __init__(self, profiles: Sequence[Profile]) -> None:
-        tables = [_tabulated(one) for one in profiles]
+        tables = [np.asarray(sum(_tables_of_blurs(one))) for one in profiles]
         ends = np.cumsum([table.shape[1] for table in tables])
         self._first = np.concatenate([[0], ends[:-1]])
         self._last = ends - 2
@@ -215,14 +227,14 @@ class _Blurred:
         return -reduced / self.sigma if order == 1 else (reduced**2 - 1) / self.sigma**2
 
 
-def _tabulated(profile: Profile) -> NDArray[np.float64]:
-    """Return absorbed shares and derivatives (2, n) at multiples of TABLE_STEP from the centre."""
+def _tables_of_blurs(profile: Profile) -> list[NDArray[np.float64]]:
+    """Return shares and derivatives (2, n) at multiples of TABLE_STEP, for each Gaussian."""
     tables = []
     for weight, sigma in profile.blurs:
         blurred = _Blurred(profile, sigma)
         row = blurred.row(profile.absorbed(blurred.squared))
         tables.append(weight * np.stack([blurred.table(row), blurred.table(row, 1)]))
-    return np.asarray(sum(tables))
+    return tables
 
 
 def shadow_derivatives(

@@ -144,7 +144,7 @@ class ShadowFit(ABC):
         self.low = -np.inf  # grey values at which the image is clipped
         self.high = np.inf
         self.crossing: np.ndarray | None = None
-        self.texture = Texture.none(n, self.offset)
+        self.texture = Texture.none(n, self.offset, (profile.sharpening, profile.mask_px))
         self.groups: list[Group] = []
 
     def _set_windows(
@@ -362,6 +362,32 @@ class ShadowFit(ABC):
             self.influence = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
         return inverse
 
+    def _textured_slope(self) -> NDArray[np.float64]:
+        """Return relative slopes (n, 2) of the backgrounds beyond the polynomials [1/px].
+
+        They are those of the planes that fit them best where the place of a shadow is determined.
+        """
+        slope = np.zeros_like(self.uv)
+        distance = np.linalg.norm(self.offset, axis=1)
+        border = self.profile.shadow(distance)[1] ** 2
+        plane = border[:, None] * self.offset / (0.5 * border @ distance**2)
+        for group in self.groups:
+            textured = self.texture.strength[group[0]] > 0
+            rows, near = group[0][textured], group[1][textured]
+            light, _ = self._model(rows, near)
+            grey = self.grey[rows]
+            weight = self._valid(rows, grey, light) / self.noise.variance(light)
+            relative = self.background.relative(rows, light)
+            for cosines, own in self.texture.in_windows(rows):
+                expected = cosines.expected(
+                    self.texture.strength[rows[own]],
+                    relative[own],
+                    weight=weight[own],
+                    residual=(grey - light)[own],
+                )
+                slope[rows[own]] += expected @ plane / self.background.light[rows[own], None]
+        return slope
+
     def _images(self, windows: np.ndarray) -> NDArray[np.float64]:
         """Return square images (g, w, w) of round windows (g, m)."""
         half = int(np.abs(self.offset).max())
@@ -395,10 +421,14 @@ class ShadowFit(ABC):
         sigma = np.sqrt(self.sigma**2 + by_correlation) * factor
         # The noise of holes in a sheet does not increase with the inverted light: they are not
         # shadows that attenuate it.
-        variance = self.profile.variance_px2 if self.noise.gain else 0.0
-        drawn = self.background.drawn(self.uv - self.middle, variance)
+        blurred, masked = self.profile.drawn_px2 if self.noise.gain else (0.0, 0.0)
+        slope = self.background.slope(self.uv - self.middle)
+        drawn = blurred * slope
+        shift = DRAWN * drawn
+        if masked:  # it amplifies edges, so that the background beyond the polynomial counts, too
+            shift += masked * (slope + self._textured_slope())
         return Beads(
-            self.uv + DRAWN * drawn,
+            self.uv + shift,
             np.hypot(sigma, DRAWN_SD * np.sqrt(0.5 * (drawn * drawn).sum(axis=1))),
             depth=self.depth.copy(),
             light=self.background.light,

@@ -48,6 +48,8 @@ EM_STEPS = 30  # iterations after which the share of windows has converged to 0.
 # was taken, errors in renderings with plates were 6 to 11 % larger. NO_EDGE: there is no edge.
 DIRECTIONS = 24
 NO_EDGE = -1
+Mask = tuple[float, float]  # factor of an unsharp mask, and standard deviation of its blur [px]
+NO_MASK = 0.0, 0.0
 
 
 # Derivatives (g, u, m) of the light in windows; its share that passes the beads, its weights and
@@ -69,17 +71,18 @@ def window_offsets(radius_px: float) -> NDArray[np.int64]:
 
 
 @lru_cache(maxsize=2 * DIRECTIONS)
-def _cosines_in(squared_px: int, across: int) -> Cosines:
+def _cosines_in(squared_px: int, across: int, mask: Mask) -> Cosines:
     """Return the waves in a round window; squared_px: square of its radius."""
     angle = None if across == NO_EDGE else across * np.pi / DIRECTIONS
-    return Cosines(window_offsets(float(np.sqrt(squared_px + 0.5))), DTYPE, angle)
+    return Cosines(window_offsets(float(np.sqrt(squared_px + 0.5))), DTYPE, angle, mask)
 
 
 class Cosines:
     """Cosines on the pixels of a window, and their variances.
 
     offset: (m, 2) pixels relative to the middle of the window. across: direction across a straight
-    edge [rad], in which the background changes more; None for a background without an edge.
+    edge [rad], in which the background changes more; None for a background without an edge. mask:
+    unsharp mask of the image, which amplifies short waves.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class Cosines:
         offset: NDArray[np.int64],
         dtype: type[np.floating],
         across: float | None = None,
+        mask: Mask = NO_MASK,
     ) -> None:
         half = float(np.abs(offset).max()) + 0.5
         angle = across or 0.0
@@ -105,7 +109,10 @@ class Cosines:
                 [number, [(i, 0) for i in range(HIGHEST + 1, 2 * HIGHEST + 1)]]
             )
         self.waves = (along_x[number[:, 0]] * along_y[number[:, 1]]).astype(dtype)
-        power = np.sum(number**2, axis=1) ** (-EXPONENT / 2)
+        squared = np.sum(number**2, axis=1)
+        factor, mask_px = mask
+        wider = np.exp(-0.5 * squared * (np.pi * mask_px / (2 * half)) ** 2)
+        power = squared ** (-EXPONENT / 2) * (1 + factor * (1 - wider)) ** 2
         if across is not None:
             power[number[:, 1] == 0] *= EDGE
         # Scaled so that a background of unit strength has unit variance at a pixel.
@@ -162,15 +169,37 @@ class Cosines:
 
         strength (g,) is positive; the other arguments are those of `spectra`.
         """
+        weighted, inner = self._normal(strength, relative, weight)
+        stacked = np.concatenate([jacobian, residual[:, None].astype(jacobian.dtype)], axis=1)
+        cross = (weighted @ np.swapaxes(stacked, 1, 2)).astype(float)
+        explained = np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)
+        return explained[:, :-1, :-1], explained[:, :-1, -1], explained[:, -1, -1]
+
+    def expected(
+        self,
+        strength: NDArray[np.float64],
+        relative: NDArray[np.float32],
+        weight: NDArray[np.floating],
+        residual: NDArray[np.float32],
+    ) -> NDArray[np.float64]:
+        """Return the expected backgrounds (g, m); the arguments are those of `eliminated`."""
+        weighted, inner = self._normal(strength, relative, weight)
+        right = (weighted @ residual[..., None]).astype(float)
+        return np.asarray(np.linalg.solve(inner, right)[..., 0] @ self.waves)
+
+    def _normal(
+        self,
+        strength: NDArray[np.float64],
+        relative: NDArray[np.float32],
+        weight: NDArray[np.floating],
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Return weighted waves (g, k, m), and the normal matrices (g, k, k) of coefficients."""
         waves = relative[:, None] * self.waves
         weighted = waves * weight.astype(waves.dtype)[:, None]
         inner = (weighted @ np.swapaxes(waves, 1, 2)).astype(float)
         diagonal = np.arange(len(self.variance))
         inner[:, diagonal, diagonal] += 1 / (strength[:, None] * self.variance)
-        stacked = np.concatenate([jacobian, residual[:, None].astype(jacobian.dtype)], axis=1)
-        cross = (weighted @ np.swapaxes(stacked, 1, 2)).astype(float)
-        explained = np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)
-        return explained[:, :-1, :-1], explained[:, :-1, -1], explained[:, -1, -1]
+        return weighted, inner
 
 
 @dataclass(frozen=True)
@@ -262,12 +291,13 @@ class Texture:
     #: (n,), numbers of the directions across a straight edge, NO_EDGE for none
     across: NDArray[np.int64]
     squared_px: int  #: square of the radius of the windows
+    mask: Mask  #: unsharp mask of the image
 
     @classmethod
-    def none(cls, count: int, offset: NDArray[np.int64]) -> Texture:
+    def none(cls, count: int, offset: NDArray[np.int64], mask: Mask) -> Texture:
         """Return that of windows of pixels (m, 2) with a polynomial background."""
         squared_px = int((offset**2).sum(axis=1).max(initial=0))
-        return cls(np.zeros(count), np.full(count, NO_EDGE), squared_px)
+        return cls(np.zeros(count), np.full(count, NO_EDGE), squared_px, mask)
 
     def estimated(
         self,
@@ -308,11 +338,11 @@ class Texture:
         textured = np.flatnonzero(self.strength[rows])
         across = self.across[rows[textured]]
         for direction in np.unique(across).tolist():
-            yield _cosines_in(self.squared_px, direction), textured[across == direction]
+            yield _cosines_in(self.squared_px, direction, self.mask), textured[across == direction]
 
     def _spectra(self, across: int, part: Part) -> Spectra:
         jacobian, relative, weight, residual = part
-        cosines = _cosines_in(self.squared_px, across)
+        cosines = _cosines_in(self.squared_px, across, self.mask)
         return cosines.spectra(relative, jacobian, weight=weight, residual=residual)
 
 

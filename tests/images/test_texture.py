@@ -5,10 +5,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from fluoro_calib_ros.images.background import Background
+from fluoro_calib_ros.images.profile import Profile
 from fluoro_calib_ros.images.texture import Cosines, window_offsets
 
 OFFSET = window_offsets(8.0)
@@ -33,6 +36,7 @@ def test_elimination_is_weighting_by_the_covariance_of_the_background():
     taken = COSINES.eliminated(
         strength, relative=relative, jacobian=jacobian, weight=weight, residual=residual
     )
+    expected = COSINES.expected(strength, relative, weight=weight, residual=residual)
     for k in range(2):
         waves = relative[k] * COSINES.waves
         covariance = np.diag(1 / weight[k])
@@ -44,6 +48,8 @@ def test_elimination_is_weighting_by_the_covariance_of_the_background():
         assert left == pytest.approx(jacobian[k] @ inverse @ jacobian[k].T, rel=1e-6)
         assert right == pytest.approx(jacobian[k] @ inverse @ residual[k], rel=1e-6, abs=1e-6)
         assert squared == pytest.approx(residual[k] @ inverse @ residual[k], rel=1e-6)
+        shared = strength[k] * (COSINES.waves.T * COSINES.variance) @ waves
+        assert expected[k] == pytest.approx(shared @ inverse @ residual[k], rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize('true', [1.0, 30.0])
@@ -167,9 +173,47 @@ def test_blur_draws_a_shadow_towards_less_light():
     seen = (shadow * axis[inside]).sum() / shadow.sum()
     background = Background(1, OFFSET, 8.0)
     background.terms[0, 1] = slope * 8
-    drawn = background.drawn(np.zeros((1, 2)), 1.5**2)
-    assert drawn[0] == pytest.approx([-seen, 0], abs=2e-3)
+    assert background.slope(np.zeros((1, 2)))[0] == pytest.approx([slope, 0])
     assert seen == pytest.approx(-slope * 1.5**2, abs=2e-3)
+
+
+@pytest.mark.parametrize('sharpening', [0.0, 1.5])
+def test_mask_shifts_a_shadow_less_than_its_variance(sharpening):
+    """Compare with a fit to a shadow in an exponential background, sharpened numerically."""
+    profile = Profile(7.0, 1.0, 0.9, sharpening=sharpening, mask_px=3.0)
+    fine, half, slope = 5, 24, 0.01
+    axis = np.arange(-half * fine, half * fine + 1) / fine
+    x, y = np.meshgrid(axis, axis)
+    raw = np.exp(slope * x) * (1 - profile.absorbed(x * x + y * y))
+    image = sum(
+        weight * cv2.GaussianBlur(raw, (0, 0), fine * sigma, borderType=cv2.BORDER_REPLICATE)
+        for weight, sigma in profile.blurs
+    )
+    inside = x * x + y * y < 14**2
+    x, y, image = x[inside], y[inside], image[inside]
+
+    def misclosure(unknowns):
+        place, depth, *light = unknowns
+        shadow, _ = profile.shadow(np.hypot(x - place, y))
+        plane = light[0] + light[1] * x + light[2] * x * x + light[3] * y * y
+        return np.exp(plane) * (1 - depth * shadow) - image
+
+    seen = least_squares(misclosure, [0, 1, 0, slope, 0, 0], x_scale='jac').x[0]
+    blurred, masked = profile.drawn_px2
+    assert blurred == pytest.approx(1 + 1 / 12)
+    assert seen == pytest.approx(-slope * (blurred + masked), rel=0.1)
+    assert (masked == 0) == (sharpening == 0)
+
+
+def test_mask_amplifies_short_waves():
+    """The variance of a wave is multiplied by the squared gain of the mask at its frequency."""
+    plain = Cosines(OFFSET, np.float64)
+    masked = Cosines(OFFSET, np.float64, mask=(1.5, 3.0))
+    half = np.abs(OFFSET).max() + 0.5
+    gain = np.sqrt(masked.variance / plain.variance)
+    # The first waves are one and two half waves along y: frequencies in radians per pixel.
+    expected = [1 + 1.5 * (1 - np.exp(-4.5 * (n * np.pi / (2 * half)) ** 2)) for n in (1, 2)]
+    assert gain[1] / gain[0] == pytest.approx(expected[1] / expected[0])
 
 
 @pytest.mark.parametrize('angle', [-1.2, 0.3, 1.0])

@@ -390,16 +390,12 @@ def _weigh(
     step.m = (m + np.swapaxes(m, 1, 2)) / 2
 
 
-@dataclass
-class _Scores:
-    """Derivatives (T, B, 2) of the log likelihood with respect to h, and their information."""
+def _smooth(steps: Sequence[_Step]) -> tuple[Motion, NDArray[np.float64]]:
+    """Smooth backwards over the steps of a filter.
 
-    gradient: NDArray[np.float64]
-    information: NDArray[np.float64]
-
-
-def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
-    """Smooth backwards over the steps of a filter."""
+    Returns also derivatives of the log likelihood with respect to h, and their information, (2, T,
+    B, 2).
+    """
     count = len(steps[0].z)
     rows = []
     scores = []
@@ -429,7 +425,7 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
     log_q = np.stack([step.log_q for step in steps])
     rotation, centre, velocity, acceleration, covariance = map(np.stack, zip(*rows[::-1]))
     motion = Motion(rotation, centre, velocity, acceleration, covariance=covariance, log_q=log_q)
-    return motion, _Scores(*np.stack(scores[::-1], axis=1))
+    return motion, np.stack(scores[::-1], axis=1)
 
 
 def _moved(
@@ -520,11 +516,14 @@ def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion
 
 def _improved(
     log_q: NDArray[np.float64],
-    scores: _Scores,
+    scores: NDArray[np.float64],
     dt_s: NDArray[np.float64],
     walk: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """Return log densities (T, B, 2) after a scoring step, its size, and walks (B, 2)."""
+    """Return log densities (T, B, 2) after a scoring step, its size, and walks (B, 2).
+
+    scores: as from `_smooth`.
+    """
     out = log_q.copy()
     new_walk = walk.copy()
     largest = 0.0
@@ -532,11 +531,12 @@ def _improved(
         h = log_q[:, body, kind]
         prior = 1 / (walk[body, kind] * np.maximum(dt_s[1:], 1e-6))
         banded = np.zeros((2, len(h)))
-        banded[1] = scores.information[:, body, kind] + 1e-6
+        gradient, information = scores[:, :, body, kind]
+        banded[1] = information + 1e-6
         banded[1, :-1] += prior
         banded[1, 1:] += prior
         banded[0, 1:] = -prior
-        right = scores.gradient[:, body, kind].copy()
+        right = gradient.copy()
         pull = prior * np.diff(h)
         right[:-1] += pull
         right[1:] -= pull

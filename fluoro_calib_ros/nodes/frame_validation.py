@@ -102,41 +102,30 @@ class FrameValidator:
 
         Raises Refused for a frame that cannot be corrected as a whole.
         """
-        sigma = frame.sigma
-        count = len(frame.target_id) // 4
-        if len(frame.u) != count or len(frame.v) != count or len(sigma) not in (0, count):
+        ids, sigma = np.frombuffer(frame.target_id, np.uint32), frame.sigma
+        if not len(ids) == len(frame.u) == len(frame.v) or len(sigma) not in (0, len(ids)):
             arrays = {'u': frame.u, 'v': frame.v, **({'sigma': sigma} if len(sigma) else {})}
-            raise self._refused('lengths', frame, length_error(_target_ids(frame), **arrays))
-        if frame.image_size != calibration.image_size:
-            raise self._refused(
-                'image size', frame, image_size_error(frame.image_size, calibration.image_size)
-            )
+            self._require('lengths', frame, length_error(ids, **arrays))
+        error = image_size_error(frame.image_size, calibration.image_size)
+        self._require('image size', frame, error)
         frame_id = frame.frame_id
         if frame_id != calibration.frame_id and frame_id and calibration.frame_id:
-            raise self._refused(
-                'frame id',
-                frame,
-                f'the frame id is {frame_id}, but the calibration is of {calibration.frame_id}',
-            )
+            error = f'the frame id is {frame_id}, but the calibration is of {calibration.frame_id}'
+            self._require('frame id', frame, error)
         if frame.target_id != self._unique:
-            error = repeated_target_error(_target_ids(frame))
-            if error:
-                raise self._refused('repeated target', frame, error)
+            self._require('repeated target', frame, repeated_target_error(ids))
             self._unique = frame.target_id
         if not len(sigma):
             return frame.u, frame.v, None
         if not (sigma.min() > 0 and sigma.max() < np.inf):  # false for NaN, too
-            raise self._refused('sigma', frame, sigma_error(_target_ids(frame), sigma))
+            self._require('sigma', frame, sigma_error(ids, sigma))
         return frame.u, frame.v, sigma
 
-    def _refused(self, kind: str, frame: ObservedFrame, reason: str) -> Refused:
-        return Refused(
-            kind, f'fluoroscope {self._fluoroscope}, frame {frame.frame_number}: {reason}'
-        )
-
-
-def _target_ids(frame: ObservedFrame) -> NDArray[np.uint32]:
-    return np.frombuffer(frame.target_id, np.uint32)
+    def _require(self, kind: str, frame: ObservedFrame, error: str) -> None:
+        """Raise Refused if there is an error."""
+        if error:
+            where = f'fluoroscope {self._fluoroscope}, frame {frame.frame_number}'
+            raise Refused(kind, f'{where}: {error}')
 
 
 def validate_corrected(fluoroscope: str, frame: CorrectedFrame) -> None:

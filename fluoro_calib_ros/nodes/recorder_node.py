@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -54,18 +54,10 @@ _RECORDING = ParameterGroup(RecordingOptions)
 PARAMETERS = (_NODE, _RECORDING)
 
 
-class RecorderState(NamedTuple):
-    """Why writing failed, what was dropped, and what never arrived; '' means none."""
-
-    fault: str
-    loss: str
-    overrun: str
-
-
 CONDITIONS = (
-    fails(lambda state: state.fault and (state.loss or state.fault)),
-    warns(lambda state: state.loss),
-    warns(lambda state: state.overrun),
+    fails(lambda node: node.fault()),
+    warns(lambda node: node.loss()),
+    warns(lambda node: node.lost_at_input()),
     healthy('recording'),
 )
 
@@ -146,18 +138,22 @@ class RecorderNode(ParameterNode):
             received = info.get('received_timestamp') or time.time_ns()
             sent = info.get('source_timestamp') or received
             if not self._recording.put(topic, data, received, sent):
-                self._limited_logger.error(self._loss())
+                self._limited_logger.error(self.loss())
 
         self._reader.subscribe(published.kind, topic, on_message, qos, decode=lambda data: data)
         self.get_logger().info(f'recording {topic} [{published.type_name}]')
 
-    def _loss(self) -> str:
+    def fault(self) -> str:
+        """Return a message if writing has failed, '' if it has not."""
+        return self._recording.fault and (self.loss() or self._recording.fault)
+
+    def loss(self) -> str:
         """Return a message about dropped messages and the cause, '' if none was dropped."""
         dropped = lost_text(self._recording.dropped)
         cause = self._recording.fault or 'the disk is too slow'
         return f'messages are dropped, {cause}: {dropped}' if dropped else ''
 
-    def _lost_at_input(self) -> str:
+    def lost_at_input(self) -> str:
         """Return a message about messages lost at the input, '' if none was lost."""
         lost = lost_text(self._overrun)
         return f'messages are lost at the input, they come too fast: {lost}' if lost else ''
@@ -176,19 +172,15 @@ class RecorderNode(ParameterNode):
             'files': recording.files,
             'waiting [MB]': f'{recording.waiting_bytes / 1e6:.1f}',
         }
-        state = RecorderState(recording.fault, self._loss(), self._lost_at_input())
-        self._diagnostics.publish([Status('recorder', *health_of(state, CONDITIONS), counts)])
+        self._diagnostics.publish([Status('recorder', *health_of(self, CONDITIONS), counts)])
 
     def stop(self) -> None:
         """Write all received messages, and close the bag."""
         self._reader.stop(take_pending=True)
         self._recording.stop()
-        loss = self._loss()
-        if loss or self._recording.fault:
-            self.failed = self.failed or bool(self._recording.fault)
-            self.get_logger().error(loss or self._recording.fault)
-        if self._overrun:
-            self.get_logger().error(self._lost_at_input())
+        self.failed = self.failed or bool(self._recording.fault)
+        for fault in filter(None, (self.fault() or self.loss(), self.lost_at_input())):
+            self.get_logger().error(fault)
         missing = sorted(self._topics_of_graph.wanted - self._topics)
         if missing:
             self.get_logger().warning(f'nobody has published {", ".join(missing)}')

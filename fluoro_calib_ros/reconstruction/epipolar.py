@@ -17,7 +17,6 @@ If they miss each other by a little, the same trials may find the cause.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -39,7 +38,6 @@ from .intersection import (
     REJECTED,
     SINGLE_VIEW,
     STATUS_NAMES,
-    IntersectedPoints,
 )
 from .reconstruct import ReconstructedFrame, RigRecording
 
@@ -197,7 +195,6 @@ UNMATCHED = Finding(
     advice='the target ids of the fluoroscopes, or the numbers of their frames, do not belong '
     'together',
 )
-RECENT = 100  # number of recent exposures of a stream
 # Maximum ratios of a trial to the recording, for the share of rejected points and the median miss,
 # to accept the cause of the trial.
 BETTER = 0.3
@@ -205,31 +202,21 @@ CLOSER = 0.6
 
 
 Trial = tuple[Finding, RigRecording]
+Counts = tuple[int, int, int]  # see `counts_of`
 
 
-class RecentMisses:
-    """Share of the rays in recent exposures of a stream that miss each other."""
+def recent_misses(counts: Sequence[Counts], timing: Finding | None = None) -> Finding | None:
+    """Return what is wrong if the points of recent exposures are implausible, or None.
 
-    def __init__(self) -> None:
-        self._recent: deque[tuple[int, int, int]] = deque(maxlen=RECENT)
-
-    def add(self, points: IntersectedPoints) -> None:
-        """Add the points of an exposure."""
-        self._recent.append(_counts(points.status))
-
-    def finding(self, timing: Finding | None = None) -> Finding | None:
-        """Return what is wrong if the points of the recent exposures are implausible, or None.
-
-        timing: fault of their timing, which is the cause if there is one.
-        """
-        rejected, total, single = (
-            sum(column) for column in zip(*list(self._recent) or [(0, 0, 0)])
-        )
-        if not total and single >= MIN_POINTS:
-            return UNMATCHED
-        if total < MIN_POINTS or rejected <= MAX_REJECTED * total:
-            return None
-        return missing_rays(rejected / total, timing or UNKNOWN)
+    counts: `counts_of` the points of each. timing: fault of their timing, which is the cause if
+    there is one.
+    """
+    rejected, total, single = (sum(column) for column in zip(*counts or [(0, 0, 0)]))
+    if not total and single >= MIN_POINTS:
+        return UNMATCHED
+    if total < MIN_POINTS or rejected <= MAX_REJECTED * total:
+        return None
+    return missing_rays(rejected / total, timing or UNKNOWN)
 
 
 def missing_rays(share: float, reason: Finding) -> Finding:
@@ -241,11 +228,11 @@ def missing_rays(share: float, reason: Finding) -> Finding:
 def share_rejected(reconstructed: Sequence[ReconstructedFrame]) -> tuple[float, int]:
     """Return the share of rejected points, and the number of points in two views."""
     status = np.concatenate([frame.points.status for frame in reconstructed] or [np.empty(0, int)])
-    rejected, total, _ = _counts(status)
+    rejected, total, _ = counts_of(status)
     return rejected / max(total, 1), total
 
 
-def _counts(status: NDArray[np.integer]) -> tuple[int, int, int]:
+def counts_of(status: NDArray[np.integer]) -> Counts:
     """Return the numbers of rejected points, of points in two views, and in a single one."""
     counts = np.bincount(status, minlength=len(STATUS_NAMES))
     rejected = int(counts[REJECTED] + counts[FAILED])

@@ -94,23 +94,6 @@ class IntersectedPoints:
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Least-squares solution of n points.
-
-    failed (n,): whether the rays have no intersection. by_rig (n,): part of the expected squared
-    lack of fit that is due to the orientation of the rig.
-    """
-
-    xyz: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    standardised: NDArray[np.float64]
-    failed: NDArray[np.bool_]
-    by_rig: NDArray[np.float64]
-
-
 class Intersector:
     """Intersection of rays for one RigOrientation, built once for all frames.
 
@@ -196,25 +179,22 @@ class Intersector:
         seen = np.isfinite(uv.sum(axis=2) + weight) & (weight > 0)
         rays = seen.sum(axis=1)
         if rays.min(initial=self._count) == self._count:  # the usual frame needs no masks
-            return self._classified(uv, weight, rays, self._solve(uv, weight, rays), scatter)
+            return self._classified(uv, weight, rays, scatter)
         uv = np.where(seen[:, :, None], uv, 0.0)
         weight = np.where(seen, weight, 0.0)
         intersecting = rays >= 2
         points = self._classified(
-            uv[intersecting],
-            weight[intersecting],
-            rays[intersecting],
-            self._solve(uv[intersecting], weight[intersecting], rays[intersecting]),
-            scatter,
+            uv[intersecting], weight[intersecting], rays[intersecting], scatter
         )
         return points if intersecting.all() else _expanded(points, intersecting, rays)
 
     def _solve(
         self, uv: NDArray[np.float64], weight: NDArray[np.float64], rays: NDArray[np.int64]
-    ) -> _Solution:
-        """Solve for the points of image points uv (n, F, 2).
+    ) -> tuple[IntersectedPoints, NDArray[np.float64]]:
+        """Return the points of image points uv (n, F, 2), with the status OK or FAILED.
 
-        weight (n, F) [1/px^2]: 0 where a point is unseen. rays (n,): number of rays.
+        weight (n, F) [1/px^2]: 0 where a point is unseen. rays (n,): number of rays. Also returns
+        the part (n,) of the expected squared lack of fit that the orientation of the rig causes.
         """
         n, count = weight.shape
         flat = np.repeat(weight, 2, axis=1)[:, :, None]
@@ -244,15 +224,18 @@ class Intersector:
         expected = freedom + ((by_residual * by_residual).sum(axis=2) * flat[:, :, 0]).sum(axis=1)
         residual = np.sqrt(((r * r)[:, :, 0] * (flat[:, :, 0] > 0)).sum(axis=1) / (2 * rays))
         in_front = np.where(weight > 0, depth, 1.0).min(axis=1, initial=1.0) > 0
-        return _Solution(
+        failed = ~in_front | ~(determinant > MIN_DETERMINANT)
+        points = IntersectedPoints(
             xyz,
             inverse + by_point @ by_point.transpose(0, 2, 1),
-            noise=inverse,
+            covariance_noise=inverse,
             residual=residual,
+            rays=rays,
             standardised=np.sqrt(squares.sum(axis=1) / expected),
-            failed=~in_front | ~(determinant > MIN_DETERMINANT),
-            by_rig=1 - freedom / expected,
+            status=np.where(failed, FAILED, OK).astype(np.uint8),
+            dropped_view=np.full(n, -1),
         )
+        return points, 1 - freedom / expected
 
     def _start(self, uv: NDArray[np.float64], flat: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the linear solution (n, 3) for image points uv (n, F, 2).
@@ -272,83 +255,61 @@ class Intersector:
         uv: NDArray[np.float64],
         weight: NDArray[np.float64],
         rays: NDArray[np.int64],
-        solution: _Solution,
         scatter: ObservedScatter | None,
     ) -> IntersectedPoints:
-        """Assign the status to the points of a solution; drop false rays if the others agree."""
+        """Return the points with their status; drop false rays if the others agree."""
+        points, by_rig = self._solve(uv, weight, rays)
+        failed = points.status == FAILED
         limit = self._limit
         if scatter is not None and self.reject is not None:
-            size = np.where(solution.failed, np.nan, solution.standardised) / self._median[rays]
-            scatter.add(size, solution.by_rig, limit[2] / self._median[2])
+            size = np.where(failed, np.nan, points.standardised) / self._median[rays]
+            scatter.add(size, by_rig, limit[2] / self._median[2])
             limit = scatter.factor * limit
-        is_wrong = solution.failed | (solution.standardised > limit[rays])
-        dropped_view = np.full(len(rays), -1)
-        if is_wrong.any():
-            rows = np.flatnonzero(is_wrong & (rays > 2))
-            if len(rows):
-                solution, dropped_view[rows] = self._drop_one_ray(
-                    uv[rows],
-                    weight[rows],
-                    rays=rays[rows],
-                    rows=rows,
-                    solution=solution,
-                    limit=limit,
-                )
-                rays = rays - (dropped_view >= 0)
-                is_wrong = is_wrong & (dropped_view < 0)
-            unknown = np.where(is_wrong, np.nan, 1.0)[:, None]
-            solution = replace(
-                solution,
-                xyz=solution.xyz * unknown,
-                covariance=solution.covariance * unknown[..., None],
-                noise=solution.noise * unknown[..., None],
-            )
-        status = np.where(is_wrong, np.where(solution.failed, FAILED, REJECTED), OK).astype(
-            np.uint8
-        )
-        return IntersectedPoints(
-            xyz_mm=solution.xyz,
-            covariance=solution.covariance,
-            covariance_noise=solution.noise,
-            residual=solution.residual,
-            rays=rays,
-            standardised=solution.standardised,
-            status=status,
-            dropped_view=dropped_view,
+        is_wrong = failed | (points.standardised > limit[rays])
+        if not is_wrong.any():
+            return points
+        rows = np.flatnonzero(is_wrong & (rays > 2))
+        if len(rows):
+            points = self._without_false_rays(uv[rows], weight[rows], points, rows, limit)
+            is_wrong = is_wrong & (points.dropped_view < 0)
+        unknown = np.where(is_wrong, np.nan, 1.0)[:, None]
+        return replace(
+            points,
+            xyz_mm=points.xyz_mm * unknown,
+            covariance=points.covariance * unknown[..., None],
+            covariance_noise=points.covariance_noise * unknown[..., None],
+            status=np.where(is_wrong & (points.status == OK), REJECTED, points.status),
         )
 
-    def _drop_one_ray(
+    def _without_false_rays(
         self,
         uv: NDArray[np.float64],
         weight: NDArray[np.float64],
-        rays: NDArray[np.int64],
+        points: IntersectedPoints,
         rows: NDArray[np.int64],
-        solution: _Solution,
         limit: NDArray[np.float64],
-    ) -> tuple[_Solution, NDArray[np.int64]]:
-        """Replace points of a solution by those without their false rays.
+    ) -> IntersectedPoints:
+        """Replace points by those without their false rays.
 
         Each ray of the image points uv (m, F, 2) of the points in rows (m,) is dropped in turn. If
         the remaining rays agree in exactly one case, that case is the solution. Otherwise the
         false ray cannot be identified. limit (F + 1,): maximum lack of fit by the number of rays.
-        Returns the solution and the index (m,) of the dropped fluoroscope, -1 if there is none.
         """
         m, count = weight.shape
         remaining = (weight[:, None, :] * (1 - np.eye(count))).reshape(m * count, count)
-        remaining_rays = np.repeat(rays - 1, count)
-        candidates = self._solve(np.repeat(uv, count, axis=0), remaining, remaining_rays)
-        agree = ~candidates.failed & (candidates.standardised <= limit[remaining_rays])
+        remaining_rays = np.repeat(points.rays[rows] - 1, count)
+        candidates, _ = self._solve(np.repeat(uv, count, axis=0), remaining, remaining_rays)
+        agree = (candidates.status == OK) & (candidates.standardised <= limit[remaining_rays])
         agree = agree.reshape(m, count) & (weight > 0)
-        dropped = np.where(agree.sum(axis=1) == 1, agree.argmax(axis=1), -1)
-        identified = np.flatnonzero(dropped >= 0)
-        if not len(identified):
-            return solution, dropped
-        chosen = identified * count + dropped[identified]
+        identified = np.flatnonzero(agree.sum(axis=1) == 1)
+        dropped = agree[identified].argmax(axis=1)
+        candidates = replace(candidates, dropped_view=np.tile(np.arange(count), m))
         values = {}
-        for field in fields(_Solution):
-            values[field.name] = getattr(solution, field.name).copy()
-            values[field.name][rows[identified]] = getattr(candidates, field.name)[chosen]
-        return _Solution(**values), dropped
+        for field in fields(points):
+            values[field.name] = getattr(points, field.name).copy()
+            chosen = getattr(candidates, field.name)[identified * count + dropped]
+            values[field.name][rows[identified]] = chosen
+        return IntersectedPoints(**values)
 
 
 def _expanded(

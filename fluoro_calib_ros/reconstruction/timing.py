@@ -26,10 +26,11 @@ from ..exposures.stamps import NS_PER_S, StampedFrame
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..rows import chosen_rows, joined_rows
-from .epipolar import RECENT, EpipolarGeometry, RecentMisses
+from .epipolar import Counts, EpipolarGeometry, counts_of, recent_misses
 from .intersection import IntersectedPoints
 from .reconstruct import CorrectedView, RigRecording, match_views
 
+RECENT = 100  # number of recent exposures of a stream
 MAX_EXPOSURES = 200  # number of exposures tested: they determine a delay to 0.01 frame intervals
 MAX_POINTS = 10_000  # number of their image points in a: 50 each
 MIN_SIGMAS = 5.0  # minimum delay over its standard deviation: one in a million by chance
@@ -111,13 +112,12 @@ class RecentExposures(Generic[AnyFrame]):
 
     def __init__(self, corrected: Callable[[AnyFrame], CorrectedView]) -> None:
         self._corrected = corrected
-        self._recent: deque[Mapping[str, AnyFrame]] = deque(maxlen=RECENT)
-        self._misses = RecentMisses()
+        # Exposures, and counts of their points; see `recent_misses`.
+        self._recent: deque[tuple[Mapping[str, AnyFrame], Counts]] = deque(maxlen=RECENT)
 
     def add(self, exposure: Mapping[str, AnyFrame], points: IntersectedPoints) -> None:
         """Add an exposure, frames by fluoroscope, with its points."""
-        self._recent.append(exposure)
-        self._misses.add(points)
+        self._recent.append((exposure, counts_of(points.status)))
 
     def faults(
         self, orientation: RigOrientation, is_doubtful: bool
@@ -127,10 +127,13 @@ class RecentExposures(Generic[AnyFrame]):
         The timing, which takes 0.05 s, is only judged if most rays miss each other, or if the rig
         is doubtful for another reason.
         """
+        recent = list(self._recent)
+        counts = [each for _, each in recent]
         timing = None
-        if is_doubtful or self._misses.finding() is not None:
-            timing = timing_fault(list(self._recent), self._corrected, orientation)
-        return self._misses.finding(timing), timing
+        if is_doubtful or recent_misses(counts) is not None:
+            exposures = [exposure for exposure, _ in recent]
+            timing = timing_fault(exposures, self._corrected, orientation)
+        return recent_misses(counts, timing), timing
 
 
 def timing_of_recording(recording: RigRecording) -> Finding | None:

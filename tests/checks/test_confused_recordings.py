@@ -36,9 +36,10 @@ from fluoro_calib_ros.jobs.orientation import orient
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.epipolar import (
-    RecentMisses,
     cause_of_misses,
+    counts_of,
     mismatch,
+    recent_misses,
     share_rejected,
 )
 from fluoro_calib_ros.reconstruction.intersection import (
@@ -50,6 +51,7 @@ from fluoro_calib_ros.reconstruction.intersection import (
     Intersector,
 )
 from fluoro_calib_ros.reconstruction.reconstruct import RigRecording
+from fluoro_calib_ros.reconstruction.timing import RecentExposures
 from fluoro_calib_ros.report import html as html_report
 from fluoro_calib_ros.simulation.rig import Detection, detect_beads, phantom_poses, virtual_rig
 
@@ -417,14 +419,12 @@ def test_share_of_rejected_points_is_of_points_of_two_views():
     found = [SimpleNamespace(points=SimpleNamespace(status=part)) for part in (status, status[:4])]
     assert share_rejected(found) == (6 / 14, 14)
     assert share_rejected([]) == (0.0, 0)
-    misses = RecentMisses()
-    misses.add(SimpleNamespace(status=status))
-    assert misses.finding() is None  # 10 points are too few
-    misses.add(SimpleNamespace(status=status))
-    assert misses.finding().numbers['share'] == 0.6
-    alone = RecentMisses()
-    alone.add(SimpleNamespace(status=np.full(20, SINGLE_VIEW)))
-    assert alone.finding().kind is Kind.NO_COMMON_TARGETS
+    assert recent_misses([]) is None
+    counts = counts_of(status)
+    assert recent_misses([counts]) is None  # 10 points are too few
+    assert recent_misses([counts, counts]).numbers['share'] == 0.6
+    alone = counts_of(np.full(20, SINGLE_VIEW))
+    assert recent_misses([alone]).kind is Kind.NO_COMMON_TARGETS
 
 
 def test_some_false_matches_do_not_refuse_a_reconstruction():
@@ -507,19 +507,19 @@ def test_a_stream_whose_rays_miss_each_other_is_noticed_and_forgotten():
     def of(some):
         return RigRecording(some, calibrations(), Intersector(orientation())).reconstruct()
 
-    misses = RecentMisses()
-    assert misses.finding() is None
+    recent = RecentExposures(lambda frame: None)
+    assert recent.faults(orientation(), False) == (None, None)
     for found in of(frames()):
-        misses.add(found.points)
-    assert misses.finding() is None
+        recent.add({}, found.points)
+    assert recent.faults(orientation(), False) == (None, None)
     for _ in range(3):
         for found in of(exchanged(frames())):
-            misses.add(found.points)
-    assert misses.finding().kind is Kind.RAYS_DO_NOT_MEET
+            recent.add({}, found.points)
+    assert recent.faults(orientation(), False)[0].kind is Kind.RAYS_DO_NOT_MEET
     for _ in range(10):
         for found in of(frames()):
-            misses.add(found.points)
-    assert misses.finding() is None
+            recent.add({}, found.points)
+    assert recent.faults(orientation(), False) == (None, None)
 
 
 # ---- orientation from a capture, and adjustment

@@ -59,9 +59,8 @@ class BodyCameras(Cameras):
         if self._ids is None or len(ids) != len(self._ids) or (ids != self._ids).any():
             order = np.argsort(ids)
             positions = np.searchsorted(ids[order], self.target_id.ravel())
-            rows = order[np.minimum(positions, len(ids) - 1)] if len(ids) else positions * 0 - 1
-            known = (ids[rows] == self.target_id.ravel()) if len(ids) else rows >= 0
-            self._rows = np.where(known, rows, len(ids))
+            known = np.append(ids[order], -2)[positions] == self.target_id.ravel()  # -1 is padding
+            self._rows = np.where(known, np.append(order, -1)[positions], len(ids))
             self._ids = ids
         shape = (*self.target_id.shape, self.count)
         # One additional row for markers that are not present.

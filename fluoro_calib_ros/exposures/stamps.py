@@ -248,13 +248,12 @@ class ExposureNumbers:
             return self._without_stamp[fluoroscope]
         self._tolerance.add(fluoroscope, stamp_ns)
         tolerance_ns = self._tolerance.ns
-        nearest: tuple[int, int, set[str]] | None = None
-        for exposure in self._recent:
-            offset = abs(exposure[0] - stamp_ns)
-            if offset > tolerance_ns or fluoroscope in exposure[2]:
-                continue
-            if nearest is None or offset <= abs(nearest[0] - stamp_ns):
-                nearest = exposure  # the newest of equally near ones, for repeated recordings
+        fitting = (
+            exposure
+            for exposure in reversed(self._recent)  # the newest of equally near ones, for repeats
+            if abs(exposure[0] - stamp_ns) <= tolerance_ns and fluoroscope not in exposure[2]
+        )
+        nearest = min(fitting, key=lambda exposure: abs(exposure[0] - stamp_ns), default=None)
         if nearest is None:
             nearest = (stamp_ns, self._new_number(stamp_ns), set())
             self._recent.append(nearest)

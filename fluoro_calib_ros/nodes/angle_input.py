@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +22,6 @@ from .runtime.streams import FaultHandlers, StreamReader
 from .runtime.topics import observations_qos
 
 TOPIC = 'joint_states'
-
-
-class Asked(NamedTuple):
-    """Last angle request of a fluoroscope: stamp of the exposure [ns] and angle [rad] or None."""
-
-    stamp_ns: int
-    angle: float | None
 
 
 class AngleInput:
@@ -49,7 +42,8 @@ class AngleInput:
         self._logger = logger
         self._received = 0
         self._refused = 0
-        self._asked: dict[str, Asked] = {}
+        # Last requests: stamp of the exposure [ns], and angle [rad] or None.
+        self._asked: dict[str, tuple[int, float | None]] = {}
         self._unknown = dict.fromkeys(names, 0)  # exposures without an angle
         self._seen = dict.fromkeys(names, 0)  # value at the last health()
         self._doubted: set[str] = set()
@@ -92,7 +86,7 @@ class AngleInput:
         logged.
         """
         angle = self._angles.at(name, stamp_ns)
-        self._asked[name] = Asked(stamp_ns, angle)
+        self._asked[name] = stamp_ns, angle
         if angle is not None:
             self._doubted.discard(name)
         elif needed:
@@ -106,10 +100,9 @@ class AngleInput:
         """Return the diagnostic values of a fluoroscope; empty if it has no joint."""
         if name not in self._angles.joints and not self._unknown[name]:
             return {}
-        lookup = self._asked.get(name)
-        known = lookup is not None and lookup.angle is not None
+        _, angle = self._asked.get(name, (0, None))
         return {
-            'angle [deg]': f'{math.degrees(lookup.angle):.3f}' if known else '',  # type: ignore
+            'angle [deg]': '' if angle is None else f'{math.degrees(angle):.3f}',
             'frames without angle': self._unknown[name],
             'joint states received': self._received,
             'joint states late': self._angles.late(name),
@@ -128,8 +121,8 @@ class AngleInput:
 
     def _doubt(self, name: str) -> str:
         """Return why the angle of the last exposure, or of an earlier one, is unknown."""
-        lookup = self._asked[name]
-        reason = self._angles.doubt(name, lookup.stamp_ns) or 'some exposures had none'
+        stamp_ns, _ = self._asked[name]
+        reason = self._angles.doubt(name, stamp_ns) or 'some exposures had none'
         return f'the angle of the C-arm is unknown: {reason}'
 
     def _on_state(self, state: tuple[Any, ...], _: Mapping[str, int]) -> None:

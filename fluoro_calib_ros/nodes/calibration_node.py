@@ -56,11 +56,12 @@ from .shape_learning import ShapeLearning
 
 __all__ = ['PARAMETERS', 'CalibrationNode', 'main']
 
-OBSERVATIONS = 'target_observations'
-
 
 class CalibrationNode(StreamNode):
     """Collects exposures of the fluoroscopes, and runs one self-calibration at a time."""
+
+    subject = 'target observations'
+    topics = ('target_observations',)
 
     def __init__(self) -> None:
         super().__init__('calibration_node', CalibrationSettings)
@@ -130,7 +131,7 @@ class CalibrationNode(StreamNode):
         """Receive the observations of all fluoroscopes in one thread."""
         faults = stream_faults(self._exposures.streams, self.fail)
         reader = self._angles.create_reader(self, faults)
-        subscribe_frames(reader, self, OBSERVATIONS, self._on_frame)
+        subscribe_frames(reader, self, self.topics[0], self._on_frame)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Clean up, unless a request is being answered."""
@@ -187,8 +188,6 @@ class CalibrationNode(StreamNode):
             FluoroscopeState,
             self,
             stream,
-            [OBSERVATIONS],
-            'target observations',
             counts={'unpaired': collected.status.frames_unpaired},
             collected=collected,
             output=self._output,

@@ -95,12 +95,10 @@ class CorrectingNode(StreamNode):
     """
 
     item: ClassVar[str] = ''  #: corrected item: frame or image
-    subject: ClassVar[str] = ''  #: subscribed messages, in words
     refusal_kinds: ClassVar[tuple[str, ...]] = ()
     #: what becomes of the items at an angle far from all calibrated ones
     beyond: ClassVar[str] = ''
     stream_kind: ClassVar[type[CorrectedStream]] = CorrectedStream
-    topics: tuple[str, ...] = ()  #: subscribed topics, relative to each fluoroscope
 
     def __init__(self, name: str, settings: type[Any]) -> None:
         super().__init__(name, settings)
@@ -185,7 +183,7 @@ class CorrectingNode(StreamNode):
 
     def _diagnose(self, stream: CorrectedStream) -> Status:
         name = stream.name
-        state = state_of(CorrectingState, self, stream, self.topics, self.subject)
+        state = state_of(CorrectingState, self, stream)
         values = {
             f'{self.item}s received': stream.received,
             'lost at the input': stream.overrun,

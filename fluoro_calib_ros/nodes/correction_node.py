@@ -74,7 +74,7 @@ class CorrectionNode(CorrectingNode):
     def create_outputs(self) -> None:
         """Create the outputs and subscribe to calibrations."""
         self._corrected = self.create_outputs_of(
-            self.names, CorrectedObservations, 'corrected_observations', observations_qos
+            CorrectedObservations, 'corrected_observations', observations_qos
         )
         self._info = {}
         for name in self.names:

@@ -215,10 +215,13 @@ RADIOGRAPH = 'radiograph'
 class ExtractionNode(StreamNode):
     """Publishes the targets found in images."""
 
+    subject = 'images'
+
     def __init__(self) -> None:
         super().__init__('extraction_node', ExtractionSettings)
         settings = self.settings
         self._inputs = INPUTS[settings.node.inputs]
+        self.topics = tuple(topic for _, topic in self._inputs)
         AngleInput(settings.angles, self.names, self.limited_logger)  # refuses unknown joints
         self._followers = read_followers(settings, self.get_logger())
         # Used to predict marker positions when views are followed jointly; only these need angles.
@@ -238,7 +241,7 @@ class ExtractionNode(StreamNode):
             name: ImageStream(
                 name,
                 RefusalLog('image', self.limited_logger),
-                topic=f'{name}/{self._inputs[0][1]}',
+                topic=f'{name}/{self.topics[0]}',
             )
             for name in self.names
         }
@@ -261,7 +264,7 @@ class ExtractionNode(StreamNode):
 
     def create_outputs(self) -> None:
         """Create the outputs."""
-        outputs = partial(self.create_outputs_of, self.names)
+        outputs = self.create_outputs_of
         self._observations = outputs(TargetObservations, OBSERVATIONS, observations_qos)
         self._overlays = outputs(Image, OVERLAY, images_qos)
         self._retractions = outputs(Retraction, RETRACTIONS, observations_qos)
@@ -353,8 +356,7 @@ class ExtractionNode(StreamNode):
     def _diagnose(self, stream: ImageStream) -> Status:
         name = stream.name
         stream.measure()
-        topics = [topic for _, topic in self._inputs]
-        state = state_of(ImageState, self, stream, topics, 'images', angles=self._angles)
+        state = state_of(ImageState, self, stream, angles=self._angles)
         values = {
             **stream.values(self._workers.waiting(name)),
             'lost at the input': stream.overrun,

@@ -123,7 +123,7 @@ class ImageNode(CorrectingNode):
 
     def create_outputs(self) -> None:
         """Create the outputs and subscribe to calibrations."""
-        outputs = partial(self.create_outputs_of, self.names)
+        outputs = self.create_outputs_of
         self._images = outputs(Image, CORRECTED, images_qos)
         self._compressed = outputs(CompressedImage, f'{CORRECTED}/compressed', images_qos)
         # image_transport looks for the CameraInfo in the namespace of the image. The correction

@@ -8,6 +8,7 @@ from collections import Counter
 from types import MappingProxyType, SimpleNamespace
 
 import pytest
+from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Reset
 from rclpy.task import Future
 
@@ -71,7 +72,7 @@ def test_lost_messages_come_first_and_the_last_condition_always_holds(conditions
     lost.fail('a/topic', IndexError('thirteen'))
     level, message = health_of(SimpleNamespace(refusals=lost), conditions)
     assert level == ERROR and message.endswith('topic a/topic: IndexError: thirteen')
-    state = SimpleNamespace(progress=SimpleNamespace(is_calibrating=False, calibration=None))
+    state = SimpleNamespace(collected=SimpleNamespace(status=CalibrationStatus()))
     assert conditions[-1](state).level == OK
 
 

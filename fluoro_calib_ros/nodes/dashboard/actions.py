@@ -50,20 +50,21 @@ class Actions:
         self._to_cancel = False  # as soon as the goal is accepted
         self._running: _Kind | None = None
         self._sent_at = 0.0
-        calibrate = ActionClient(node, SelfCalibrate, 'self_calibrate')
-        heal = ActionClient(node, Heal, 'heal')
-        self._calibrate = _Kind(CALIBRATE, calibrate, 'calibrating', feedback_text)
-        self._heal = _Kind(HEAL, heal, 'healing', healing_text)
+        client = ActionClient(node, SelfCalibrate, 'self_calibrate')
+        calibrate = _Kind(CALIBRATE, client, 'calibrating', feedback_text)
+        heal = _Kind(HEAL, ActionClient(node, Heal, 'heal'), 'healing', healing_text)
+        goal = SelfCalibrate.Goal
+        # Kind, goal and text of each request.
+        self._requests: dict[str, tuple[_Kind, Any, str]] = {
+            CALIBRATE: (calibrate, goal(validate=True), 'calibrate, with verdict ...'),
+            CALIBRATE_FAST: (calibrate, goal(validate=False), 'calibrate, without verdict ...'),
+            HEAL: (heal, Heal.Goal(), 'heal, from the markers that are seen now ...'),
+        }
         self._namespace = node.get_namespace()
 
     def request(self, action: str) -> None:
         """Start one of CALIBRATE, CALIBRATE_FAST and HEAL."""
-        if action == HEAL:
-            self._start(self._heal, Heal.Goal(), 'heal, from the markers that are seen now ...')
-            return
-        validate = action != CALIBRATE_FAST
-        text = 'calibrate, with verdict ...' if validate else 'calibrate, without verdict ...'
-        self._start(self._calibrate, SelfCalibrate.Goal(validate=validate), text)
+        self._start(*self._requests[action])
 
     def cancel(self) -> None:
         """Cancel the running action, if it was started here."""
@@ -108,10 +109,11 @@ class Actions:
             elif self._goal is not None and not kind.client.server_is_ready():
                 self._end(f'{kind.name} failed: the calibration node has ended')
 
-    def _end(self, text: str) -> None:
-        self._goal = None
-        self._job = ''
-        self._set(job='')
+    def _end(self, text: str, **changes: Any) -> None:
+        with self._lock:
+            self._goal = None
+            self._job = ''
+        self._set(job='', **changes)
         self._say(text)
 
     def _on_goal(self, kind: _Kind, future: Future) -> None:
@@ -129,13 +131,9 @@ class Actions:
     def _on_result(self, kind: _Kind, future: Future) -> None:
         answer = future.result()
         result = answer.result
-        with self._lock:
-            self._goal = None
-            self._job = ''
-        changes: dict[str, Any] = {'job': ''}
+        changes = {}
         succeeded = answer.status == GoalStatus.STATUS_SUCCEEDED
         if succeeded and kind.name == HEAL:
             findings = (*result.findings, *result.checks)
             changes['diagnosis'] = Diagnosis(result.verdict, findings, result.orientation_id)
-        self._set(**changes)
-        self._say(f'{kind.name}{"" if succeeded else " failed"}: {result.message}')
+        self._end(f'{kind.name}{"" if succeeded else " failed"}: {result.message}', **changes)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Capture, Orient, Reset
 from rclpy.clock import Clock, ClockType
@@ -196,16 +196,11 @@ class SessionClient(Node):
                 functions = self._functions.setdefault(node, {})
                 functions[function] = NodeState(function, level, status.message), now
                 values = {value.key: value.value for value in status.values}
-                self._read(node, function, values, stamp_s, status)
+                if function == 'drift':
+                    self._set(drift_level=level, drift=status.message)
+                self._read(node, function, values, stamp_s)
 
-    def _read(
-        self,
-        node: str,
-        function: str,
-        values: dict[str, str],
-        stamp_s: float,
-        status: DiagnosticStatus,
-    ) -> None:
+    def _read(self, node: str, function: str, values: dict[str, str], stamp_s: float) -> None:
         """Copy the values of a diagnostic status into the session state."""
         received = values.get('frames received')
         corrected = values.get('frames corrected')
@@ -241,9 +236,6 @@ class SessionClient(Node):
                 orientation=values.get('source of the orientation', ''),
                 orientation_id=values.get('orientation', ''),
             )
-        elif function == 'drift':
-            level = LEVELS[min(int.from_bytes(status.level, 'little'), 2)]
-            self._set(drift_level=level, drift=status.message)
 
     def _follow(self, name: str) -> None:
         """Subscribe to the status of a fluoroscope, once."""
@@ -351,9 +343,7 @@ def _print(client: SessionClient) -> None:
 
     from .terminal import session_text
 
-    end = time.monotonic() + SILENT_S
-    while time.monotonic() < end:
-        time.sleep(0.1)
+    time.sleep(SILENT_S)
     state = client.state()
     Console().print(session_text(state))
     if not state.nodes:

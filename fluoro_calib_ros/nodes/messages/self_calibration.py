@@ -79,23 +79,17 @@ def fill_result(result: Result, job: CalibrationResult, calibrations: Calibratio
         result.calibration_id = [*result.calibration_id, calibration.calibration_id]
         result.model_kind = [*result.model_kind, calibration.model.kind]
         result.converged = [*result.converged, calibration.converged]
-        for field, value in (
-            ('k', calibration.model.k),
-            ('iterations', calibration.iterations),
-            ('observations', calibration.observations),
-            ('inliers', calibration.inliers),
-            ('xp', calibration.interior[0]),
-            ('yp', calibration.interior[1]),
-            ('c', calibration.interior[2]),
-            ('sd_xp', sd[0]),
-            ('sd_yp', sd[1]),
-            ('sd_c', sd[2]),
-            ('rmse_before_u', calibration.rmse_before[0]),
-            ('rmse_before_v', calibration.rmse_before[1]),
-            ('rmse_after_u', calibration.rmse_after[0]),
-            ('rmse_after_v', calibration.rmse_after[1]),
+        result.k.append(calibration.model.k)
+        for field in ('iterations', 'observations', 'inliers'):
+            getattr(result, field).append(getattr(calibration, field))
+        for fields, values in (
+            ('xp yp c', calibration.interior),
+            ('sd_xp sd_yp sd_c', sd),
+            ('rmse_before_u rmse_before_v', calibration.rmse_before),
+            ('rmse_after_u rmse_after_v', calibration.rmse_after),
         ):
-            getattr(result, field).append(value if isinstance(value, int) else float(value))
+            for field, value in zip(fields.split(), values):
+                getattr(result, field).append(float(value))
     note = '' if job.converged else ' (stopped at the maximum number of rounds, not converged)'
     result.message = f'{", ".join(calibrations)} calibrated in {job.seconds:.1f} s{note}'
 

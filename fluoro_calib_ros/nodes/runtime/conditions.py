@@ -62,13 +62,9 @@ class InputState:
 
 @dataclass(frozen=True)
 class StreamState(InputState):
-    """State from which the health of a stream is diagnosed; one of its topics suffices.
-
-    subject: what is published there, in words.
-    """
+    """State from which the health of a stream is diagnosed; one of its topics suffices."""
 
     stream: Stream
-    subject: str
 
 
 Kind = TypeVar('Kind', bound=StreamState)
@@ -78,25 +74,21 @@ def state_of(
     kind: type[Kind],
     node: StreamNode,
     stream: Stream,
-    topics: Iterable[str],
-    subject: str,
-    *,
     counts: Mapping[str, int] | None = None,
     **values: Any,
 ) -> Kind:
     """Return the state of the stream of a fluoroscope.
 
-    topics: names relative to the fluoroscope. counts: further counts of which the growth matters.
-    values: further fields of this kind of state.
+    counts: further counts of which the growth matters. values: further fields of this kind of
+    state.
     """
     refused, overrun = stream.refusals.total, stream.overrun
     return kind(
         node=node,
-        topics=tuple(f'{stream.name}/{topic}' for topic in topics),
+        topics=tuple(f'{stream.name}/{topic}' for topic in node.topics),
         refusals=stream.refusals,
         recent=node.recent.growth(stream.name, refused=refused, overrun=overrun, **(counts or {})),
         stream=stream,
-        subject=subject,
         **values,
     )
 
@@ -104,7 +96,7 @@ def state_of(
 def missing_publisher(state: StreamState) -> str:
     """Return a message if nobody publishes the stream."""
     has_publisher = any(map(state.node.has_publisher, state.topics))
-    return '' if has_publisher else f'no publisher of {state.subject}'
+    return '' if has_publisher else f'no publisher of {state.node.subject}'
 
 
 def _unpaired(state: InputState) -> str:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
@@ -48,6 +48,9 @@ class StreamNode(ParameterNode, LifecycleNode):
     must work in every state. A transition that raises is logged, which rclpy would not do, and
     undone; after a failed deactivate() or cleanup(), everything is cleaned up.
     """
+
+    subject: ClassVar[str] = ''  #: messages of the streams, in words
+    topics: tuple[str, ...] = ()  #: their topics, relative to each fluoroscope
 
     def __init__(self, name: str, settings: type[Any]) -> None:
         super().__init__(name)
@@ -96,10 +99,10 @@ class StreamNode(ParameterNode, LifecycleNode):
         return self.own(publisher, self.destroy_publisher, publisher)
 
     def create_outputs_of(
-        self, names: Iterable[str], kind: type, topic: str, qos: Callable[[], QoSProfile]
+        self, kind: type, topic: str, qos: Callable[[], QoSProfile]
     ) -> dict[str, Publisher]:
-        """Create the publishers <name>/<topic> of several fluoroscopes, by name."""
-        return {name: self.create_output(kind, f'{name}/{topic}', qos()) for name in names}
+        """Create the publishers <fluoroscope>/<topic>, by fluoroscope."""
+        return {name: self.create_output(kind, f'{name}/{topic}', qos()) for name in self.names}
 
     def create_input(
         self,

@@ -157,6 +157,7 @@ def test_a_damaged_calibration_is_named_until_another_one_is_in_use():
     stream = correcting_node.CorrectedStream('a', refusals())
     node = SimpleNamespace(
         item='frame',
+        subject='observations',
         incompatible={},
         readers=['active'],
         has_publisher=lambda topic: False,
@@ -165,7 +166,7 @@ def test_a_damaged_calibration_is_named_until_another_one_is_in_use():
         get_publishers_info_by_topic=lambda topic: (),
     )
     state = correcting_node.CorrectingState(
-        node, ('a/target_observations',), stream.refusals, Counter(), stream, 'observations'
+        node, ('a/target_observations',), stream.refusals, Counter(), stream
     )
     stream.refused_calibration = 'a.calibration.npz: this is no calibration file'
     assert health_of(state, correcting_node.CONDITIONS) == (
@@ -185,7 +186,7 @@ def test_the_calibration_node_tells_why_frames_have_no_partner_first():
         recent=Counter(unpaired=7),
         stream=SimpleNamespace(name='a', received=9),
         output=SimpleNamespace(load_fault='', save_fault='', refused={}),
-        progress=SimpleNamespace(calibration_id=''),
+        collected=SimpleNamespace(status=CalibrationStatus()),
         disagreement='frames of a are not numbered',
     )
     state.node.get_publishers_info_by_topic = lambda topic: ()

@@ -26,6 +26,7 @@ from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.limits import CollectLimits
 from fluoro_calib_ros.nodes import calibration_input, calibration_services
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
+from fluoro_calib_ros.nodes.calibration_output import CalibrationOutput
 from fluoro_calib_ros.nodes.calibration_services import OrientationService, SelfCalibration
 from fluoro_calib_ros.nodes.calibration_settings import CalibrationSettings, RigSetup
 from fluoro_calib_ros.nodes.exposure_input import PairWait
@@ -311,12 +312,21 @@ class Waits:
         return self.wait
 
 
+def output_of(calibrations):
+    """Return the output of a calibration node of a and b with calibrations in use."""
+    output = CalibrationOutput.__new__(CalibrationOutput)
+    output._names = ('a', 'b')
+    output._in_use = dict(calibrations)
+    output.orientation = None
+    return output
+
+
 def orientation_service(output):
     """Return the service orient of a rig of a and b, and a request to it."""
     node = SimpleNamespace(
         create_timer=lambda *_, **__: None,
         destroy_timer=lambda _: None,
-        readers=['active'],
+        check_active=lambda: None,
         executor=None,
         get_logger=lambda: None,
     )
@@ -342,11 +352,11 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
     outcome = SimpleNamespace(
         orientation=SimpleNamespace(fluoroscopes=('a', 'b'), calibration_ids=('a-old', 'b-old'))
     )
-    output = SimpleNamespace(calibrations=dict(old), orientation=None)
+    output = output_of(old)
     service, request = orientation_service(output)
 
     async def recalibrated():
-        output.calibrations.update(new)
+        output._in_use.update(new)
         return outcome
 
     monkeypatch.setattr(calibration_services, 'in_thread', lambda *_: (recalibrated(), None))
@@ -360,14 +370,14 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
 
 
 def test_orientation_from_too_many_frames_is_refused():
-    service, request = orientation_service(SimpleNamespace(calibrations={}))
+    service, request = orientation_service(output_of({}))
     request.frames = 4_000_000_000
     with pytest.raises(DataError, match='frames must be at most 500'):
         service._orient(request).send(None)
 
 
 def test_a_rig_that_is_not_calibrated_is_refused_before_the_capture():
-    output = SimpleNamespace(calibrations={'a': SimpleNamespace(calibration_id='a')})
+    output = output_of({'a': SimpleNamespace(calibration_id='a')})
     service, request = orientation_service(output)
     with pytest.raises(DataError, match='fluoroscope b is not calibrated yet'):
         service._orient(request).send(None)

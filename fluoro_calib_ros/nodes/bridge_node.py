@@ -281,16 +281,15 @@ class BridgeNode(ParameterNode):
             newcomers = self._newcomers
             self._newcomers = set()
         for shown in self._shown.values():
-            if shown.topic in read_topics and shown.subscription is None:
-                self._subscribe(shown)
-            elif shown.topic not in read_topics and shown.subscription is not None:
-                self.destroy_subscription(shown.subscription)
-                shown.subscription = None
-            elif shown.subscription is not None and (
-                (shown.topic in newcomers and shown.is_latched)
+            is_read = shown.topic in read_topics
+            if shown.subscription is not None and (
+                not is_read
+                or (shown.topic in newcomers and shown.is_latched)
                 or is_outdated(self, shown.subscription)
             ):
                 self.destroy_subscription(shown.subscription)
+                shown.subscription = None
+            if is_read and shown.subscription is None:
                 self._subscribe(shown)
 
     def _discover(self) -> None:

@@ -204,14 +204,6 @@ def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> 
     return joined
 
 
-__all__ = ['PARAMETERS', 'ExtractionNode', 'main']
-
-OBSERVATIONS = 'target_observations'
-OVERLAY = 'image_overlay'
-RETRACTIONS = 'retractions'
-RADIOGRAPH = 'radiograph'
-
-
 class ExtractionNode(StreamNode):
     """Publishes the targets found in images."""
 
@@ -265,10 +257,10 @@ class ExtractionNode(StreamNode):
     def create_outputs(self) -> None:
         """Create the outputs."""
         outputs = self.create_outputs_of
-        self._observations = outputs(TargetObservations, OBSERVATIONS, observations_qos)
-        self._overlays = outputs(Image, OVERLAY, images_qos)
-        self._retractions = outputs(Retraction, RETRACTIONS, observations_qos)
-        self._radiographs = outputs(CompressedImage, RADIOGRAPH, observations_qos)
+        self._observations = outputs(TargetObservations, 'target_observations', observations_qos)
+        self._overlays = outputs(Image, 'image_overlay', images_qos)
+        self._retractions = outputs(Retraction, 'retractions', observations_qos)
+        self._radiographs = outputs(CompressedImage, 'radiograph', observations_qos)
 
     def create_readers(self) -> None:
         """Receive the images of all fluoroscopes in one thread, and number them."""

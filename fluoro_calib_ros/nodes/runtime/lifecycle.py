@@ -9,7 +9,8 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
@@ -33,7 +34,7 @@ from .diagnostics import (
     Trace,
     one_line,
 )
-from .parameters import ParameterNode, declare_groups, declare_read_limits, follow_groups
+from .parameters import ParameterNode, declare_groups, declare_read_limits, groups_of
 from .streams import FaultHandlers, StreamReader
 from .topics import qos_overrides
 
@@ -67,7 +68,13 @@ class StreamNode(ParameterNode, LifecycleNode):
         self.recent = RecentCounts()
         #: messages about publishers that cannot be received, by topic; checked once a second
         self.incompatible: dict[str, str] = {}
-        follow_groups(self, lambda: self.settings, self.use)
+        for field_name, each in groups_of(settings).items():
+            if each.settable:
+                each.follow(self, partial(self._use_group, field_name))
+
+    def _use_group(self, field_name: str, values: Any) -> None:
+        """Apply the values of the parameters of a group, which have been set."""
+        self.use(replace(self.settings, **{field_name: values}))
 
     def use(self, settings: Any) -> None:
         """Apply new settings from now on."""

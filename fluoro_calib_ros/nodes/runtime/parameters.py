@@ -244,17 +244,6 @@ def declare_groups(node: Node, settings: type[T]) -> T:
     return settings(**{name: each.declare(node) for name, each in groups_of(settings).items()})
 
 
-def follow_groups(node: Node, present: Callable[[], T], use: Callable[[T], None]) -> None:
-    """Call use() with the new settings whenever parameters have been set."""
-
-    def follow(name: str, each: ParameterGroup[Any]) -> None:
-        each.follow(node, lambda new: use(replace(present(), **{name: new})))  # type: ignore[type-var]
-
-    for name, each in groups_of(type(present())).items():
-        if each.settable:
-            follow(name, each)
-
-
 READ_LIMITS = ParameterGroup(ReadLimits)  # for every node that reads files or images
 
 

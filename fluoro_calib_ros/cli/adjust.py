@@ -50,12 +50,12 @@ def run(arguments: argparse.Namespace) -> bool:
     Raises DataError.
     """
     from ..io.folder import check_output_folder
+    from ..io.result_document import result_document
     from ..jobs.calibration import adjust
     from ..jobs.result_folder import (
         RESULT_FOLDER,
         reused_exposures,
         save_result,
-        written_document,
     )
     from ..jobs.sources import select_calibrations
     from ..report.tables import summary_table
@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> bool:
     holds = not any(f.kind is Kind.POOR_CALIBRATION_FIT for f in result.findings)
     text = HOLDS if holds else DOES_NOT_HOLD
     verdict = styled_verdict(text, 'pass' if holds else 'fail')
-    document = {**written_document(result), 'holds': holds, 'out_of_sample': reused is None}
+    document = {**result_document(result), 'holds': holds, 'out_of_sample': reused is None}
     table = summary_table(result, has_notes=False).rstrip()  # they are already printed
     print_result(arguments, document, f'{table}\n\n{verdict}')
     return holds

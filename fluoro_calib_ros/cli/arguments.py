@@ -206,8 +206,8 @@ def read_oriented_source(
 
     Raises DataError, also if the orientation belongs to other calibrations.
     """
+    from ..correction.fluoroscope_calibration import ids_of
     from ..io.calibration import load_orientation, orientation_path
-    from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrated_source
 
     recording, calibrations = read_calibrated_source(
@@ -220,7 +220,8 @@ def read_oriented_source(
     orientation = load_orientation(path)
     names = [name for name in orientation.fluoroscopes if name in recording.frames]
     with ErrorsAt(path):
-        check_orientation(orientation.subset(names) if names else orientation, calibrations)
+        used = orientation.subset(names) if names else orientation
+        used.check_calibrations(ids_of(calibrations))
     return recording, calibrations, orientation
 
 

@@ -280,12 +280,11 @@ def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
 
 def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
     """Print notes, the summary, and the verdict with the report."""
-    from ..io.result_document import validation_document
-    from ..jobs.result_folder import written_document
+    from ..io.result_document import result_document, validation_document
     from ..report.tables import summary_table, verdict_line
 
     print_findings(outcome.result.findings, 'implausible: ')
-    document = written_document(outcome.result)
+    document = result_document(outcome.result)
     lines = [summary_table(outcome.result, has_notes=False).rstrip()]
     if outcome.validation is not None:
         report = _report(arguments.out)

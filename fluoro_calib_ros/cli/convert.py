@@ -41,8 +41,9 @@ def _with_meaning(kind: str) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from ..jobs.conversion import kinds_read, kinds_written
+    from ..io.formats.registry import kinds
 
+    written = kinds(lambda format_: format_.write)
     parser.add_argument(
         'source',
         type=Path,
@@ -53,9 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--to',
         required=True,
-        choices=kinds_written(),
+        choices=written,
         metavar='KIND',
-        help=f'format to write: {"; ".join(map(_with_meaning, kinds_written()))}',
+        help=f'format to write: {"; ".join(map(_with_meaning, written))}',
     )
     add_shared(
         parser,
@@ -67,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--from',
         dest='source_kind',
-        choices=kinds_read(),
+        choices=kinds(lambda format_: format_.read),
         metavar='KIND',
         help='format of SOURCE (default: as it is recognised)',
     )

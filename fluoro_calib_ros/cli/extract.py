@@ -301,12 +301,12 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 
 def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     """Read the inputs of the extraction of markers. Raises DataError."""
+    from ..correction.fluoroscope_calibration import ids_of
     from ..images.markers import MarkerOptions
     from ..io.bodies import read_bodies
     from ..io.calibration import load_orientation, orientation_path
     from ..jobs.image_sources import ImageAngles
     from ..jobs.marker_extraction import MarkerRequest, sequences, shaped
-    from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrations, read_source, read_survey
 
     angles = ImageAngles(angle_options(arguments), angle_of(arguments))
@@ -339,7 +339,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         path = arguments.orientation or orientation_path(arguments.calibration)
         orientation = load_orientation(path).subset(arguments.fluoroscope)
         with ErrorsAt(path):
-            check_orientation(orientation, calibrations)
+            orientation.check_calibrations(ids_of(calibrations))
     return MarkerRequest(
         sources,
         first_frames,

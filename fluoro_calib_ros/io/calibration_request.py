@@ -23,13 +23,12 @@ from ..exposures.phantom import Phantom
 from ..images.codec import JPEG_START
 from ..limits import MEGABYTE
 from .access import PathLike, check_safe_name, delete_file, make_folder, read_bytes, write_bytes
-from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
+from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM, VALIDATION_NAME
 from .csv_table import read_names, write_names
 from .documents import read_json, write_json
 from .formats.native import read_known_orientations, write_known_orientations
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
-from .result_document import delete_validation
 
 VERSION = 1  # version of options.json
 
@@ -40,7 +39,7 @@ def write_request(directory: PathLike, request: CalibrationRequest) -> None:
     Raises DataError if a file cannot be written.
     """
     directory = Path(directory)
-    delete_validation(directory)
+    delete_file(directory / VALIDATION_NAME)
     write_observations_csv(directory / OBSERVATIONS, request.frames)
     write_phantom(directory / PHANTOM, request.phantom)
     document = {

@@ -22,9 +22,9 @@ from ..estimation.rounds import AdjustmentStatistics, ResidualTable, Round
 from ..findings import Finding, Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
-from .access import PathLike, delete_file
+from .access import PathLike
 from .arrays import Layout, read_arrays, to_arrays, write_arrays
-from .calibration import VALIDATION_NAME, with_digests
+from .calibration import VALIDATION_NAME, with_digest, with_digests
 from .csv_table import Table
 from .documents import write_json
 
@@ -34,11 +34,11 @@ UNITS = {'lengths': 'mm', 'image': 'px', 'angles': 'rad', 'seconds': 's'}
 
 
 def result_document(job: CalibrationResult) -> dict[str, Any]:
-    """Return a CalibrationResult as the dict of result.json.
+    """Return a CalibrationResult as the dict of result.json, with its digest.
 
     Lengths are in mm, image coordinates in px and angles in rad, as the entry `units` states.
     """
-    return {
+    document = {
         'format_version': FORMAT_VERSION,
         'created': job.created,
         'units': UNITS,
@@ -74,6 +74,7 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
         'rig_note': '; '.join(sentences(job.findings, Severity.WARNING)),
         'findings': [finding_document(finding) for finding in job.findings],
     }
+    return with_digest(document)
 
 
 def finding_document(finding: Finding) -> dict[str, Any]:
@@ -287,11 +288,6 @@ def write_validation(directory: PathLike, validation: Validation) -> dict[str, A
     document = with_digests(directory, document, validation.calibration_id)
     write_json(Path(directory) / VALIDATION_NAME, document)
     return document
-
-
-def delete_validation(directory: PathLike) -> None:
-    """Delete validation.json from a folder if it exists. Raises DataError."""
-    delete_file(Path(directory) / VALIDATION_NAME)
 
 
 # Tables of a result as CSV files, and covariance matrices (docs/files.md).

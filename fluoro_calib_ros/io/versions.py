@@ -108,11 +108,6 @@ def write_learned_shapes(directory: PathLike, learned: LearnedShapes) -> None:
     write_json(Path(directory) / LEARNED_SHAPES, with_digest(document))
 
 
-def has_learned_shapes(directory: PathLike) -> bool:
-    """Return whether a folder contains learned shapes."""
-    return os.path.exists(Path(directory) / LEARNED_SHAPES)
-
-
 def read_learned_shapes(directory: PathLike) -> LearnedShapes:
     """Read the learned shapes of a folder. Raises DataError, also for an edited file."""
     path = Path(directory) / LEARNED_SHAPES

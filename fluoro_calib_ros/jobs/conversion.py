@@ -64,7 +64,7 @@ class ConversionRequest:
     source : path-like
         Bag, result folder, file of any format, or folder with one file per camera.
     kind : str
-        Format to write, one of `kinds_written`.
+        Format to write, one of `registry.FORMATS`.
     out : path-like
         File to write; for formats with one file per fluoroscope, folder to write.
     source_kind : str or None
@@ -102,16 +102,6 @@ class ConversionRequest:
     out_units: str | None = None
     angle: float | None = None
     angles: AngleOptions = field(default_factory=AngleOptions)
-
-
-def kinds_written() -> tuple[str, ...]:
-    """Return the formats that can be written."""
-    return registry.kinds(lambda format_: format_.write)
-
-
-def kinds_read() -> tuple[str, ...]:
-    """Return the formats that can be read from files."""
-    return registry.kinds(lambda format_: format_.read)
 
 
 def convert(request: ConversionRequest) -> Written:

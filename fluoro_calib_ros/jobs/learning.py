@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from ..errors import DataError, ErrorsAt
 from ..exposures.frame import Frames, frames_of_targets
 from ..findings import Kind
 from ..io.access import PathLike
-from ..io.versions import has_learned_shapes, read_learned_shapes
+from ..io.versions import LEARNED_SHAPES, read_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import orientation_of_recorded
 from .bodies import BodiesOptions, estimated_shapes, intersected
@@ -107,7 +108,7 @@ def learned_for(directory: PathLike, orientation: RigOrientation) -> LearnedShap
 
     Raises DataError if there are none, or if they belong to another calibration.
     """
-    if not has_learned_shapes(directory):
+    if not (Path(directory) / LEARNED_SHAPES).exists():
         raise DataError(
             f'{directory}: no shapes of bodies were learned while the rig was healthy; learn '
             'them with fluoro-calib bodies --learn, or the parameter learn_bodies of '

@@ -11,10 +11,10 @@ an earlier doubt are applied to the earlier images.
 from __future__ import annotations
 
 import heapq
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import groupby, repeat
 from pathlib import Path
 
@@ -47,6 +47,7 @@ from .image_sources import (
     is_image_bag,
     open_sources,
 )
+from .scheduling import in_order
 
 MAX_TRIES = 30  # maximum number of exposures tried for identifying markers by their shapes
 
@@ -440,15 +441,10 @@ def _exposure(named: tuple[str, SourceImage]) -> int:
 
 def _ahead(images: Iterator[SourceImage]) -> Iterator[SourceImage]:
     """Yield images that a thread reads ahead."""
-    waiting: deque[Future[SourceImage | None]] = deque()
     with ThreadPoolExecutor(1) as pool:
-        while True:
-            while len(waiting) < 3:  # number of images read ahead
-                waiting.append(pool.submit(next, images, None))
-            image = waiting.popleft().result()
-            if image is None:
-                return
-            yield image
+        # three at a time, until there is no more image
+        ahead = in_order(lambda end: pool.submit(next, images, end), repeat(None), 3)
+        yield from iter(partial(next, ahead), None)
 
 
 def _write_pictures(

@@ -158,7 +158,7 @@ def reconstructed_rays(
             'the recording does not contain the times of its exposures, pair them by frame_number'
         )
     orientation = orientation_of_recorded(frames, orientation)
-    check_orientation(orientation, calibrations)
+    orientation.check_calibrations(ids_of(calibrations))
     names = orientation.fluoroscopes
     recording, noise = with_observed_noise(
         RigRecording(frames, calibrations, Intersector(orientation, options.reject), options)
@@ -187,11 +187,6 @@ def reconstructed_rays(
         timing=timing,
     )
     return outcome, recording
-
-
-def check_orientation(orientation: RigOrientation, calibrations: Calibrations) -> None:
-    """Raise DataError unless an orientation was determined with these calibrations."""
-    orientation.check_calibrations(ids_of(calibrations))
 
 
 def _drift_watch(

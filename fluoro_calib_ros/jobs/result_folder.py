@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from ..bodies.shapes import LearnedShapes
 from ..checks.check import Check
@@ -34,7 +33,6 @@ from ..io.calibration import (
     read_result,
     save_calibration,
     save_orientation,
-    with_digest,
 )
 from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import RESULT_NAME as RESULT
@@ -197,17 +195,12 @@ def _write_result(
 ) -> None:
     for calibration in result.calibrations.values():
         save_calibration(folder, calibration)
-    write_json(folder / RESULT, written_document(result))
+    write_json(folder / RESULT, result_document(result))
     for name, table in result_tables(result).items():
         table.write(folder / name)
     doubtful = doubtful_observations(result, checks)
     if doubtful:
         doubtful_table(doubtful, known).write(folder / DOUBTFUL)
-
-
-def written_document(result: CalibrationResult) -> dict[str, Any]:
-    """Return the complete content of result.json."""
-    return with_digest(result_document(result))
 
 
 def _saved_ids(directory: PathLike, calibrations: Calibrations) -> list[str]:

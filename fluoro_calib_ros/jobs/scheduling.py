@@ -76,7 +76,7 @@ class LocalWorkers:
                 yield _alone(function, task, read_limits())
             return
         try:
-            yield from _in_order(
+            yield from in_order(
                 lambda task: threads.submit(self._call, function, task),
                 tasks,
                 QUEUED * self._count,
@@ -211,7 +211,7 @@ class DaskWorkers:
         limits = read_limits()
         threads = max(sum(self._client.nthreads().values()), 1)
         try:
-            yield from _in_order(
+            yield from in_order(
                 lambda task: self._client.submit(
                     _alone, function, task, limits, pure=False, retries=2
                 ),
@@ -229,7 +229,7 @@ def _alone(function: Callable[[Task], Result], task: Task, limits: ReadLimits) -
         return function(task)
 
 
-def _in_order(
+def in_order(
     submit: Callable[[Task], Future[Result]], tasks: Iterable[Task], queued: int
 ) -> Iterator[Result]:
     """Yield the results of submitted tasks in their order, at most `queued` at a time."""

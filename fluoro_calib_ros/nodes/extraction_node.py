@@ -20,6 +20,7 @@ from fluoro_calib_msgs.msg import Retraction, TargetObservations
 from sensor_msgs.msg import CompressedImage, Image
 
 from ..bodies.body import Body, declared_bodies
+from ..correction.fluoroscope_calibration import ids_of
 from ..errors import DataError, ErrorsAt
 from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame
@@ -37,7 +38,6 @@ from ..jobs.followers import (
     Observations,
     PhantomSettings,
 )
-from ..jobs.reconstruction import check_orientation
 from ..jobs.sources import read_calibrations, read_source, read_survey
 from ..limits import MAX_IMAGE_SIDE
 from ..options import option
@@ -199,7 +199,7 @@ def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> 
     if settings.node.bodies:
         bodies = read_bodies(expand_path(settings.node.bodies))
     joined = MarkerSettings(first, settings.following, calibrations, orientation, bodies=bodies)
-    check_orientation(orientation, calibrations)
+    orientation.check_calibrations(ids_of(calibrations))
     joined()  # refuses inconsistent settings before the node starts
     return joined
 

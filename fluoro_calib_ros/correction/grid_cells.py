@@ -172,7 +172,7 @@ def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
         )
         for x, y, n in zip(i, j, parts)
     ]
-    exact = model.evaluate_in_bulk(np.concatenate([_pixels(nodes) for nodes in part_nodes]))
+    exact = model.evaluate_in_bulk(np.concatenate([pixels_of(nodes) for nodes in part_nodes]))
     values = np.split(exact, np.cumsum((parts + 1) ** 2)[:-1], axis=1)
     first = np.concatenate([[0], np.cumsum(parts**2)[:-1]])
     table = aligned_array((int(np.sum(parts**2)), COEFFICIENTS))
@@ -234,10 +234,10 @@ def _nodes_and_values(
     model: CorrectionModel, image_size: tuple[int, int], sizes: list[float], work: float
 ) -> tuple[Nodes, NDArray[np.float64], NDArray[np.float64]]:
     """Choose the cell size; return its nodes, values (3, h, w) there, and errors of the cells."""
-    nodes = _nodes(image_size, sizes[0], 1)
+    nodes = nodes_of(image_size, sizes[0], 1)
     values = None
     for number in range(len(sizes) - 1):
-        finer_nodes = _nodes(image_size, sizes[0], 2 ** (number + 1))
+        finer_nodes = nodes_of(image_size, sizes[0], 2 ** (number + 1))
         finer_values = _exact_values(model, finer_nodes)
         values = finer_values[:, ::2, ::2]
         errors = errors_of_finer_grid(finer_values)
@@ -260,7 +260,7 @@ def _affordable_sizes(
     """
     sizes = _cell_sizes(model.smoothness, image_size)
     while True:
-        pixels = _pixels(_nodes(image_size, sizes[0], 2 ** (len(sizes) - 1)))
+        pixels = pixels_of(nodes_of(image_size, sizes[0], 2 ** (len(sizes) - 1)))
         work = model.bulk_work(pixels, MAX_WORK)
         if work <= MAX_WORK:
             return sizes, work / len(pixels)
@@ -288,7 +288,7 @@ def _cell_sizes(smoothness: Smoothness, image_size: tuple[int, int]) -> list[flo
     return sizes
 
 
-def _nodes(image_size: tuple[int, int], size: float, parts: int) -> Nodes:
+def nodes_of(image_size: tuple[int, int], size: float, parts: int) -> Nodes:
     """Return the corners of cells of at most size / parts [px], from edge to edge of an image."""
     u, v = (
         np.linspace(-0.5, length - 0.5, parts * max(1, int(np.ceil(length / size))) + 1)
@@ -297,7 +297,7 @@ def _nodes(image_size: tuple[int, int], size: float, parts: int) -> Nodes:
     return u, v
 
 
-def _pixels(nodes: Nodes) -> NDArray[np.float64]:
+def pixels_of(nodes: Nodes) -> NDArray[np.float64]:
     """Return the pixels (h * w, 2) of nodes, row by row."""
     columns, rows = nodes
     return np.stack([np.tile(columns, len(rows)), np.repeat(rows, len(columns))], axis=1)
@@ -306,7 +306,7 @@ def _pixels(nodes: Nodes) -> NDArray[np.float64]:
 def _exact_values(model: CorrectionModel, nodes: Nodes) -> NDArray[np.float64]:
     """Return du, dv and standard deviation (3, h, w) [px] of the model at nodes."""
     columns, rows = nodes
-    return model.evaluate_in_bulk(_pixels(nodes)).reshape(3, len(rows), len(columns))
+    return model.evaluate_in_bulk(pixels_of(nodes)).reshape(3, len(rows), len(columns))
 
 
 def _outside(model: CorrectionModel, nodes: Nodes) -> NDArray[np.bool_]:
@@ -317,7 +317,7 @@ def _outside(model: CorrectionModel, nodes: Nodes) -> NDArray[np.bool_]:
     columns, rows = nodes
     step = max(1, BULK_CHUNK // len(columns))
     parts = [
-        model.outside(_pixels((columns, rows[i : i + step]))) for i in range(0, len(rows), step)
+        model.outside(pixels_of((columns, rows[i : i + step]))) for i in range(0, len(rows), step)
     ]
     node = np.concatenate(parts).reshape(len(rows), len(columns))
     return node[:-1, :-1] | node[:-1, 1:] | node[1:, :-1] | node[1:, 1:]

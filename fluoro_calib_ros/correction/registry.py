@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from .base import CorrectionModel, convex_hull
-from .grid_cells import CELL_PX
+from .grid_cells import CELL_PX, nodes_of, pixels_of
 from .neighbours import HybridModel, KnnModel, LocalLinearModel
 from .series import SERIES_FIELDS, Series, unpacked
 
@@ -127,11 +127,7 @@ class LookupModel(CorrectionModel):
 def grid_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Return the nodes (n, 2) [px] of the lookup grid of an image (width, height), by rows."""
     size = max(*CELL_PX, max(image_size) / MAX_CELLS)
-    u, v = (
-        np.linspace(-0.5, length - 0.5, max(2, int(np.ceil(length / size)) + 1))
-        for length in image_size
-    )
-    return np.stack([np.tile(u, len(v)), np.repeat(v, len(u))], axis=1)
+    return pixels_of(nodes_of(image_size, size, 1))
 
 
 def hull_corners(uv: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -54,7 +54,7 @@ from ..reconstruction.reconstruct import (
     IntersectedViews,
     orientation_of_recorded,
 )
-from .image_sources import fluoroscope_folders, is_image_bag, open_sources
+from .image_sources import open_sources, source_of_each
 from .reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstructed_rays
 
 FILM_HZ = 25.0  # slow motion, because players cannot show 250 images per second
@@ -78,16 +78,7 @@ def write_films(
 
     Raises DataError for images that cannot be read, or belong to other exposures.
     """
-    folders = fluoroscope_folders(film.source)
-    if not folders and not is_image_bag(film.source):
-        raise DataError(
-            f'{film.source}: this is neither a bag with images nor a folder with a folder of '
-            'images for each fluoroscope'
-        )
-    for name in film.orientation.fluoroscopes:
-        if folders and name not in folders:
-            raise DataError(f'{film.source}: there is no folder {name} with images')
-        source = folders.get(name, film.source)
+    for name, source in source_of_each(film.source, film.orientation.fluoroscopes).items():
         frames = _frames(source, film, name, bodies=bodies, poses=poses)
         first = next(frames, None)
         if first is None:

@@ -163,6 +163,25 @@ def fluoroscope_folders(source: Path) -> dict[str, Path]:
     }
 
 
+def source_of_each(source: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Return the images of each fluoroscope: its folder in a folder, or the bag of all.
+
+    Raises DataError for another source, and for a missing folder.
+    """
+    folders = fluoroscope_folders(source)
+    if not folders and not is_image_bag(source):
+        raise DataError(
+            f'{source}: images of {" and ".join(names)} are expected in a folder for each, or in '
+            'a bag'
+        )
+    for name in names:
+        if folders and name not in folders:
+            raise DataError(
+                f'{source}: there is no folder {name} with images, only {", ".join(folders)}'
+            )
+    return {name: folders.get(name, source) for name in names}
+
+
 def _is_exposure(path: Path) -> bool:
     """Return whether a file is a radiograph by its suffix, and no picture of our results."""
     if image_suffix_of(path) not in EXPOSURE_SUFFIXES:

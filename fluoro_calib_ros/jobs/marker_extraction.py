@@ -43,9 +43,8 @@ from .image_sources import (
     ImageAngles,
     ImageSources,
     SourceImage,
-    fluoroscope_folders,
-    is_image_bag,
     open_sources,
+    source_of_each,
 )
 from .scheduling import in_order
 
@@ -188,20 +187,7 @@ def sequences(
     elif len(sources) == len(fluoroscopes):
         out = {name: [source] for name, source in zip(fluoroscopes, sources)}
     else:
-        folders = fluoroscope_folders(sources[0])
-        out = {}
-        for name in fluoroscopes:
-            if folders and name not in folders:
-                raise DataError(
-                    f'{sources[0]}: there is no folder {name} with images, only '
-                    f'{", ".join(folders)}'
-                )
-            out[name] = [folders.get(name, sources[0])]
-        if not folders and not is_image_bag(sources[0]):
-            raise DataError(
-                f'{sources[0]}: images of {" and ".join(fluoroscopes)} are expected in a folder '
-                'for each, in a bag, or in a source for each'
-            )
+        out = {name: [path] for name, path in source_of_each(sources[0], fluoroscopes).items()}
     first = next(open_sources(out[fluoroscopes[0]], fluoroscopes[0]).images(), None)
     if first is None:
         raise DataError(f'{sources[0]}: there are no images')
@@ -214,11 +200,10 @@ def shaped(bodies: Sequence[Body], phantom: Phantom, path: Path) -> tuple[Body, 
     """Return bodies with the surveyed coordinates of their markers. Raises DataError."""
     out = []
     for body in bodies:
-        absent = np.setdiff1d(body.target_id, phantom.target_id)
-        if len(absent):
-            raise DataError(f'{path}: there is no marker {absent[0]} of cluster {body.name}')
-        order = np.argsort(phantom.target_id)
-        rows = order[np.searchsorted(phantom.target_id, body.target_id, sorter=order)]
+        rows = phantom.index(body.target_id)
+        if (rows < 0).any():
+            absent = body.target_id[rows < 0].min()
+            raise DataError(f'{path}: there is no marker {absent} of cluster {body.name}')
         out.append(replace(body, xyz_mm=phantom.xyz_mm[rows], sd_mm=phantom.sd_mm[rows]))
     return tuple(out)
 

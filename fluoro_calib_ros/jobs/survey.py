@@ -134,8 +134,7 @@ def survey(
         )
     surveyed = surveyed_beads(result, request.given, request.distances)
     left_out = unsurveyed(surveyed)
-    unsurveyed_ids = {target for finding in left_out for target in finding.place.target_id}
-    beads = surveyed.without(unsurveyed_ids)
+    beads = _without(surveyed, left_out)
     checks = check_survey(surveyed)
     if len(beads.target_id) < MIN_TARGETS:
         raise DataError(
@@ -235,11 +234,13 @@ def _halves(
         except (DataError, np.linalg.LinAlgError) as error:
             return not_made(Kind.HALVES, f'half of the exposures cannot be adjusted ({error})')
         beads = surveyed_beads(half_result, start)
-        unsurveyed_ids = {
-            target for finding in unsurveyed(beads) for target in finding.place.target_id
-        }
-        surveys.append(beads.without(unsurveyed_ids))
+        surveys.append(_without(beads, unsurveyed(beads)))
     return check_survey_halves(*surveys)
+
+
+def _without(beads: SurveyedBeads, findings: Sequence[Finding]) -> SurveyedBeads:
+    """Return the beads without those that findings name."""
+    return beads.without({target for finding in findings for target in finding.place.target_id})
 
 
 def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:

@@ -139,6 +139,7 @@ def run(arguments: argparse.Namespace) -> bool:
         BodiesOptions,
         arguments,
         estimate_shapes=not arguments.keep_shapes,
+        rate=arguments.rate,
         neutral=neutral,
     )
     observed = recording.frames, calibrations, orientation, bodies

@@ -94,6 +94,7 @@ def run(arguments: argparse.Namespace) -> None:
         ReconstructionOptions,
         arguments,
         drift_watch=not arguments.no_drift_watch,
+        bodies=arguments.bodies,
         has_stamps=is_bag(arguments.source),
     )
     with ErrorsAt(arguments.source), ProgressBar('points', 'exposure') as bar:

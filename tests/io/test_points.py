@@ -1204,7 +1204,7 @@ def test_separator_of_a_table_is_that_of_its_first_row(text, separator, cells):
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize(
-    'kind', registry.kinds(lambda f: f.write and f.kind not in ('c3d', 'lut'))
+    'kind', registry.kinds(lambda f: f.write and f.kind not in ('bag', 'c3d', 'lut'))
 )
 def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind, forked):
     """They are truncated, or have missing, doubled or changed parts; only DataError is raised."""

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..brief import brief_repr
 from ..correction.angle_field import note_on_angles
@@ -355,11 +355,9 @@ def read_calibrated_source(
     path: PathLike,
     directory: PathLike,
     *,
-    image_size: tuple[int, int] | None = None,
-    fluoroscopes: Sequence[str] | None = None,
-    validate: bool = True,
     settings: FileSettings | None = None,
     selection: BagSelection | None = None,
+    **options: Any,
 ) -> tuple[Recording, dict[str, FluoroscopeCalibration]]:
     """Read all frames of a source whose fluoroscopes are calibrated, and all calibrations.
 
@@ -369,10 +367,8 @@ def read_calibrated_source(
         A bag or a file of any format.
     directory : path-like
         The result folder with the calibrations, whose names are known.
-    image_size : (int, int), optional
-        Image size of a file; by default those of the calibrations.
-    fluoroscopes, validate, settings, selection
-        As in `read_source`.
+    settings, selection, **options
+        As in `read_source`; image sizes are by default those of the calibrations.
 
     Returns
     -------
@@ -387,11 +383,9 @@ def read_calibrated_source(
     calibrations = read_calibrations(directory)
     recording = read_source(
         path,
-        image_size=image_size,
-        fluoroscopes=fluoroscopes,
-        validate=validate,
         settings=calibrated_settings(settings or FileSettings(), directory, calibrations),
         selection=selection,
+        **options,
     )
     select_calibrations(calibrations, recording.frames, directory)
     angle_notes = _unknown_angles(path, recording.frames, calibrations, selection)

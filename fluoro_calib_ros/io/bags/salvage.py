@@ -19,7 +19,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from typing import NamedTuple
 
@@ -88,7 +88,7 @@ class FileSalvage:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._last_ns: int | None = None
-        self._open_damage: tuple[str, int | None, dict[str, int]] | None = None
+        self._open_damage: Damage | None = None
         self._has_end = False
 
     def messages(self) -> Iterator[SalvagedMessage]:
@@ -242,16 +242,15 @@ class FileSalvage:
     def _note(self, cause: str, lost: dict[str, int] | None = None) -> None:
         """Begin a damage, or extend the current one."""
         if self._open_damage is None:
-            self._open_damage = (cause, self._last_ns, {})
+            self._open_damage = Damage(self.path, cause, self._last_ns, None)
+        counts = self._open_damage.lost
         for topic, count in (lost or {}).items():
-            counts = self._open_damage[2]
             counts[topic] = counts.get(topic, 0) + count
 
     def _close_damage(self, next_ns: int | None) -> None:
         """End the current damage at the time of the next message, None at the end of the file."""
         if self._open_damage is not None:
-            cause, start_ns, lost = self._open_damage
-            self.damages.append(Damage(self.path, cause, start_ns, next_ns, lost))
+            self.damages.append(replace(self._open_damage, end_ns=next_ns))
             self._open_damage = None
 
 

@@ -418,17 +418,9 @@ def file_settings(arguments: argparse.Namespace, **changes: Any) -> FileSettings
     """Return the settings added by `add_file_options`; changes replace some of them."""
     from ..io.formats.content import FileSettings
 
-    settings: dict[str, Any] = {
-        'image_size': getattr(arguments, 'image_size', None),
-        'units': arguments.units,
-        'phantom_sd_mm': arguments.phantom_sd,
-        'one_based': arguments.one_based,
-        'y_up': arguments.y_up,
-        'trial': arguments.trial,
-        'decisions': getattr(arguments, 'decisions', None),
-    }
-    settings.update(changes)
-    return FileSettings(**settings)
+    # --fluoroscopes chooses some of a source; only where it names cameras is it a change here.
+    settings = {'phantom_sd_mm': arguments.phantom_sd, 'fluoroscopes': (), **changes}
+    return options_of(FileSettings, arguments, **settings)
 
 
 def add_scheduler(parser: argparse.ArgumentParser, task: str = 'extract the images') -> None:

@@ -70,22 +70,15 @@ class _Rows:
         return chosen_rows(self, rows)
 
 
-def read_observations_csv(
-    path: PathLike, image_size: tuple[int, int] | None = None
-) -> dict[str, list[Frame]]:
+def read_observations_csv(path: PathLike, image_size: tuple[int, int]) -> dict[str, list[Frame]]:
     """Read the frames of a CSV file, by name of the fluoroscope.
 
     The rows of a frame may be anywhere in the file. sigma is given for all targets of a frame or
-    for none. image_size [px] applies to all fluoroscopes; it is required, as the file does not
-    contain it.
+    for none. image_size [px] applies to all fluoroscopes; the file does not contain it.
 
     Raises DataError that names the row for text that is not a number, a point off the image, and a
     target that occurs twice in a frame.
     """
-    if image_size is None:
-        raise DataError(
-            f'{path}: a CSV file does not contain the image size, --image-size WxH is needed'
-        )
     return _read(path, lambda _: image_size, _Columns(None))[0]
 
 

@@ -170,7 +170,7 @@ def read_survey(path: PathLike, settings: FileSettings | None = None) -> Survey:
 
 
 def read_orientations(
-    paths: Iterable[PathLike], settings: FileSettings | None = None
+    paths: Iterable[PathLike], settings: FileSettings
 ) -> dict[str, KnownOrientation]:
     """Read known orientations of fluoroscopes, by name.
 
@@ -182,7 +182,7 @@ def read_orientations(
         if holds_known_orientations(path):
             orientations = read_known_orientations(path)
         else:
-            orientations = _orientations_of_cameras(path, settings or FileSettings())
+            orientations = _orientations_of_cameras(path, settings)
         for name in orientations:
             if name in out:
                 raise DataError(f'{path}: the orientation of fluoroscope {name} is already given')

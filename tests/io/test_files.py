@@ -47,7 +47,7 @@ from fluoro_calib_ros.io.observations import (
     write_points,
 )
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
-from fluoro_calib_ros.jobs.sources import read_content
+from fluoro_calib_ros.jobs.sources import read_content, read_source
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)
@@ -387,7 +387,7 @@ def test_whole_numbers_that_are_written_as_floats_are_read(tmp_path, known):
 
 def test_observations_require_the_image_size(tmp_path):
     path = text_file(tmp_path, 'o.csv', OBSERVATIONS + 'a,0,1,2,3,\n')
-    assert '--image-size' in message_of(read_observations_csv, path)
+    assert '--image-size' in message_of(read_source, path)
 
 
 @pytest.mark.parametrize(

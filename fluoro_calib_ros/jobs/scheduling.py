@@ -11,10 +11,9 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from ipaddress import ip_address
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from ..errors import DataError
@@ -29,16 +28,9 @@ QUEUED = 3  # maximum number of queued tasks per worker
 CONNECT_S = 10  # time limit for reaching a scheduler and its first worker
 
 
-class Workers(Protocol):
-    """Workers that run a function on many tasks."""
-
-    def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
-        """Yield the results of tasks in their order; only a few of them are in memory."""
-
-
 def open_workers(
     count: int = 0, scheduler: Cluster | str | None = None, tasks: int = 0
-) -> AbstractContextManager[Workers]:
+) -> Workers:
     """Return workers as a context that ends them: local processes or those of a Dask cluster.
 
     count: number of processes, 0 for one per core. tasks: number of tasks, 0 if unknown; for a
@@ -69,7 +61,10 @@ class LocalWorkers:
             process.close()
 
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
-        """Yield the results of tasks in their order. Raises DataError if a worker died."""
+        """Yield the results of tasks in their order, with only a few in memory.
+
+        Raises DataError if a worker died.
+        """
         threads = self._threads
         if threads is None:
             for task in tasks:
@@ -220,6 +215,9 @@ class DaskWorkers:
             )
         except (KilledWorker, CancelledError, OSError) as error:
             raise DataError(f'the Dask cluster has lost a task: {error}') from None
+
+
+Workers = LocalWorkers | DaskWorkers
 
 
 def _alone(function: Callable[[Task], Result], task: Task, limits: ReadLimits) -> Result:

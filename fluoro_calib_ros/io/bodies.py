@@ -208,7 +208,10 @@ def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
             for end in ('proximal', 'distal')
         }
         joint = Joint(
-            *(texts[key] for key in REQUIRED),
+            texts['name'],
+            texts['proximal'],
+            texts['distal'],
+            texts['convention'],
             proximal_frame=frames['proximal'],
             distal_frame=frames['distal'],
             side=texts['side'],

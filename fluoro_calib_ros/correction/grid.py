@@ -108,25 +108,19 @@ class CorrectionGrid:
         return np.stack([error[:2].max(axis=0), error[2]])
 
     def look_up(
-        self,
-        u: NDArray[np.float64],
-        v: NDArray[np.float64],
-        values: NDArray[np.float64] | None = None,
-        status: NDArray[np.uint8] | None = None,
+        self, u: NDArray[np.float64], v: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Return correction, standard deviation and status at pixels.
 
-        u, v: (n,) columns and rows [px]. values, status: (3, n) and (n,) arrays for the results,
-        both or neither. Returns values: (3, n) du, dv and standard deviation [px], NaN where the
-        status is INVALID; status: (n,) `CorrectionStatus`, INVALID off the image and for
-        coordinates that are not a number.
+        u, v: (n,) columns and rows [px]. Returns values: (3, n) du, dv and standard deviation
+        [px], NaN where the status is INVALID; status: (n,) `CorrectionStatus`, INVALID off the
+        image and for coordinates that are not a number.
         """
         n = len(u)
-        if values is None or status is None:
-            if n <= CHUNK:
-                return self._look_up(u, v)
-            values = np.empty((3, n))
-            status = np.empty(n, dtype=np.uint8)
+        if n <= CHUNK:
+            return self._look_up(u, v)
+        values = np.empty((3, n))
+        status = np.empty(n, dtype=np.uint8)
         for start in range(0, n, CHUNK):
             part = slice(start, start + CHUNK)
             values[:, part], status[part] = self._look_up(u[part], v[part])

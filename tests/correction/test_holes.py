@@ -55,7 +55,6 @@ def test_lookup_has_the_status_of_the_model_but_for_a_cell():
     grid = CorrectionGrid(found, (SIDE, SIDE))
     uv = pixels(5)
     distance = np.linalg.norm(uv - HOLE, axis=1)
-    status = np.empty(len(uv), dtype=np.uint8)
-    grid.look_up(*uv.T, np.empty((3, len(uv))), status)
+    _, status = grid.look_up(*uv.T)
     assert (status[distance < RADIUS - 20] == 1).all()
     assert not status[distance > RADIUS + 60].any()

@@ -21,7 +21,7 @@ from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.io.bags.metadata import known_definition, message_from_frame
-from fluoro_calib_ros.io.bags.writer import BagWriter
+from fluoro_calib_ros.io.bags.writer import write_bag
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.simulation.rig import VirtualRig, simulate_exposures, virtual_rig
 
@@ -120,10 +120,7 @@ def bag_content(storage: str = 'mcap') -> bytes:
 
 def bag_folder(path: Path) -> None:
     """Write the frames as a bag folder."""
-    with BagWriter(path) as bag:
-        for of_one in frames().values():
-            for frame in of_one:
-                bag.write_frame(frame)
+    write_bag(path, frames())
 
 
 def images() -> list[np.ndarray]:

@@ -21,6 +21,11 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.io.bags.metadata import (
+    TARGET_OBSERVATIONS,
+    message_from_frame,
+    observations_topic,
+)
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
@@ -32,6 +37,13 @@ from fluoro_calib_ros.simulation.rig import (
     simulate_exposures,
     virtual_rig,
 )
+
+
+def write_frame(bag, frame, topic=None, log_time_ns=None):
+    """Write a frame to a bag, on the topic of its fluoroscope and at the time of its stamp."""
+    topic = topic or observations_topic(frame.fluoroscope)
+    time_ns = frame.stamp_ns if log_time_ns is None else log_time_ns
+    bag.write(topic, TARGET_OBSERVATIONS, message_from_frame(frame), time_ns)
 
 
 def create_model(kind, *arguments, **more):

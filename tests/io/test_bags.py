@@ -16,6 +16,7 @@ import yaml
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
+from rigs import write_frame
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
@@ -67,7 +68,7 @@ def write_bag(path, frames=None, split_bytes=0, **options):
         for one in some_frames() if frames is None else frames:
             if split_bytes and writer.file_bytes >= split_bytes:
                 writer.split()
-            writer.write_frame(one)
+            write_frame(writer, one)
             if split_bytes:
                 writer.flush()
     return str(path)
@@ -155,8 +156,8 @@ def test_frames_round_trip_is_exact(tmp_path, options):
 
 def test_namespaces_topics_and_qos_profiles(tmp_path):
     with BagWriter(tmp_path / 'run') as writer:
-        writer.write_frame(frame('a'), topic='/rig/a/target_observations')
-        writer.write_frame(frame('b'), topic='/other/b/target_observations')
+        write_frame(writer, frame('a'), topic='/rig/a/target_observations')
+        write_frame(writer, frame('b'), topic='/other/b/target_observations')
         hello = typestore().types['std_msgs/msg/String']('hello')
         writer.write('/text', 'std_msgs/msg/String', hello, START, START - 5, qos='latched')
         writer.add_topic('/silent', 'std_msgs/msg/Empty')
@@ -410,7 +411,7 @@ def test_bag_written_by_rosbags_is_read(tmp_path):
 
 def test_exception_leaves_no_bag(tmp_path):
     with pytest.raises(RuntimeError), BagWriter(tmp_path / 'run') as writer:
-        writer.write_frame(frame())
+        write_frame(writer, frame())
         raise RuntimeError
     assert os.listdir(tmp_path) == []
 
@@ -418,7 +419,7 @@ def test_exception_leaves_no_bag(tmp_path):
 def test_exception_leaves_an_existing_bag(tmp_path):
     path = write_bag(tmp_path / 'run')
     with pytest.raises(RuntimeError), BagWriter(path, overwrite=True) as writer:
-        writer.write_frame(frame())
+        write_frame(writer, frame())
         raise RuntimeError
     assert os.listdir(tmp_path) == ['run']
     assert_holds(path, some_frames())
@@ -426,7 +427,7 @@ def test_exception_leaves_an_existing_bag(tmp_path):
 
 def test_recording_keeps_messages_before_an_exception(tmp_path):
     with pytest.raises(RuntimeError), BagWriter(tmp_path / 'run', live=True) as writer:
-        writer.write_frame(frame())
+        write_frame(writer, frame())
         writer.flush()
         assert (tmp_path / 'run/run_0.mcap').stat().st_size > 1000
         raise RuntimeError
@@ -461,7 +462,7 @@ def test_full_disk_is_reported_and_leaves_nothing(tmp_path, monkeypatch):
         pytest.raises(DataError, match='no space left on device'),
         BagWriter(tmp_path / 'run') as writer,
     ):
-        writer.write_frame(frame())
+        write_frame(writer, frame())
         monkeypatch.setattr(os, 'fsync', full)
     assert os.listdir(tmp_path) == []
     (tmp_path / 'file').write_text('')
@@ -482,7 +483,7 @@ def test_full_disk_is_reported_and_leaves_nothing(tmp_path, monkeypatch):
 )
 def test_invalid_messages_are_reported(tmp_path, arguments, sentence):
     with BagWriter(tmp_path / 'run') as writer:
-        writer.write_frame(frame())
+        write_frame(writer, frame())
         assert sentence in message_of(writer.write, *arguments)
     assert_holds(tmp_path / 'run', [frame()])
 
@@ -568,7 +569,7 @@ def test_recording_of_more_files_than_may_be_open_is_read(tmp_path, monkeypatch)
     with BagWriter(tmp_path / 'run', live=True) as bag:
         for number in range(1, count + 1):
             for log_time in (100 * number, 100 * number + 150):
-                bag.write_frame(frame(number=number), log_time_ns=log_time)
+                write_frame(bag, frame(number=number), log_time_ns=log_time)
             bag.split()
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     open_files = len(os.listdir('/proc/self/fd'))
@@ -683,8 +684,8 @@ def test_repeated_frame_is_reported(tmp_path):
 
 def test_two_topics_of_one_fluoroscope_are_reported(tmp_path):
     with BagWriter(tmp_path / 'run') as writer:
-        writer.write_frame(frame(), topic='/x/a/target_observations')
-        writer.write_frame(frame(), topic='/y/a/target_observations')
+        write_frame(writer, frame(), topic='/x/a/target_observations')
+        write_frame(writer, frame(), topic='/y/a/target_observations')
     said = message_of(read_frames, tmp_path / 'run')
     assert '/x/a/target_observations' in said and '/y/a/target_observations' in said
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rigs import create_model
+from rigs import create_model, write_frame
 
 from fluoro_calib_ros.correction.angle_field import AngleField, packed_angles
 from fluoro_calib_ros.correction.calibration_record import FIELDS
@@ -832,7 +832,7 @@ def test_names_as_long_as_a_file_system_allows_are_written(tmp_path):
     assert (tmp_path / name / 'part').exists()
     bag = tmp_path / ('n' * 240)
     with BagWriter(bag) as writer:
-        writer.write_frame(Frame('a', 1, np.array([1]), np.array([[1.0, 2.0]]), SIZE))
+        write_frame(writer, Frame('a', 1, np.array([1]), np.array([[1.0, 2.0]]), SIZE))
     assert sorted(os.listdir(tmp_path)) == sorted([f'{name}.csv', name, bag.name])
 
 

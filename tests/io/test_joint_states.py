@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from rigs import write_frame
 
 import tests.rigs as rigs
 from fluoro_calib_ros.errors import DataError
@@ -44,7 +45,7 @@ def write_bag(path, states, frames=None):
     """Write frames of a and b, then out-of-order states (topic, stamp, names, positions)."""
     with BagWriter(path) as writer:
         for frame in frames or (*frames_of('a'), *frames_of('b')):
-            writer.write_frame(frame)
+            write_frame(writer, frame)
         for topic, stamp_ns, names, positions in states:
             message = joint_state(stamp_ns, names, positions)
             writer.write(topic, JOINT_STATE, message, START_NS + 10**10)

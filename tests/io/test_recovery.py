@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
-from rigs import run
+from rigs import run, write_frame
 from rosbags.rosbag2 import Reader
 
 from fluoro_calib_ros.errors import DataError
@@ -51,7 +51,7 @@ def bag(request, tmp_path_factory, frames):
         with BagWriter(path) as out:
             for pair in zip(*frames.values()):
                 for number, frame in enumerate(pair):  # give every message a time of its own
-                    out.write_frame(frame, log_time_ns=frame.stamp_ns + number)
+                    write_frame(out, frame, log_time_ns=frame.stamp_ns + number)
     return path
 
 
@@ -193,7 +193,7 @@ def test_split_bag_with_a_lost_file(tmp_path, frames):
         for frame in frames['a']:
             if bag.file_bytes >= 2000:
                 bag.split()
-            bag.write_frame(frame)
+            write_frame(bag, frame)
             bag.flush()
     files = sorted(path.glob('*.mcap'))
     assert len(files) > 3
@@ -212,7 +212,7 @@ def test_types_that_are_not_known_are_recovered_with_their_definition(tmp_path, 
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add_topic('/own', 'lab_msgs/msg/Trigger', 'latched', Definition('uint32 n', 'ros2msg'))
         bag.write('/own', 'lab_msgs/msg/Trigger', b'\0\1\0\0\7\0\0\0', START)
-        bag.write_frame(frames['a'][0])
+        write_frame(bag, frames['a'][0])
     content = (tmp_path / 'bag' / 'bag_0.mcap').read_bytes()
     (tmp_path / 'cut.mcap').write_bytes(content[:-20])
     recover_bag(tmp_path / 'cut.mcap', tmp_path / 'out')

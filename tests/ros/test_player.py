@@ -10,6 +10,7 @@ import time
 import pytest
 from mcap.writer import Writer
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rigs import write_frame
 from ros_graph import BAGS
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
@@ -88,8 +89,8 @@ def test_offset_behind_the_end_is_told(graph):
 def test_topics_and_prefixes_are_whole_names(graph, exposures, tmp_path, parameters, topics):
     client = graph.client
     with BagWriter(tmp_path / 'bag') as bag:
-        bag.write_frame(exposures['a'][0], '/rig/a/target_observations')
-        bag.write_frame(exposures['b'][0], '/rig_b/b/target_observations')
+        write_frame(bag, exposures['a'][0], '/rig/a/target_observations')
+        write_frame(bag, exposures['b'][0], '/rig_b/b/target_observations')
     player = graph.start(
         'player_node',
         {'bag': tmp_path / 'bag', 'start_paused': True, **parameters},

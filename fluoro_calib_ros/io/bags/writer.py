@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from ...errors import DataError
-from ...exposures.frame import Frame, Frames
+from ...exposures.frame import Frames
 from ..access import PathLike, hidden_path, os_errors, sync_folder, write_text
 from ..folder import PREVIOUS, put_in_place
 from .metadata import (
@@ -166,18 +166,6 @@ class BagWriter:
         self._files[-1].add(received_ns)
         self._total.add(received_ns)
 
-    def write_frame(
-        self, frame: Frame, topic: str | None = None, log_time_ns: int | None = None
-    ) -> None:
-        """Write a Frame as TargetObservations.
-
-        topic: by default <fluoroscope>/target_observations. log_time_ns: by default the stamp of
-        the frame. Raises DataError.
-        """
-        topic = topic or observations_topic(frame.fluoroscope)
-        time = frame.stamp_ns if log_time_ns is None else log_time_ns
-        self.write(topic, TARGET_OBSERVATIONS, message_from_frame(frame), time)
-
     def add_topic(
         self,
         topic: str,
@@ -282,7 +270,8 @@ def write_bag(path: PathLike, frames: Frames) -> None:
     recorded = [frame for view_frames in frames.values() for frame in view_frames]
     with BagWriter(path, overwrite=True) as bag:
         for frame in sorted(recorded, key=lambda f: f.stamp_ns):
-            bag.write_frame(frame)
+            topic = observations_topic(frame.fluoroscope)
+            bag.write(topic, TARGET_OBSERVATIONS, message_from_frame(frame), frame.stamp_ns)
 
 
 def check_topic_name(topic: str, path: str) -> None:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, quoted
 from ..exposures.frame import MAX_ANGLE
 from ..exposures.names import MAX_ID, Names, number_names
+from ..exposures.phantom import first_repeated
 from ..findings import sentence_of
 from ..limits import MAX_ROWS_CSV
 from .access import PathLike, atomic_file, check_rows, check_safe_name, delete_file, read_text
@@ -101,6 +102,16 @@ class Block:
         if not np.all(valid):
             index = int(np.argmin(valid))
             self.fail(index, f'{name} is {self.strings(name)[index]!r}, {cause}')
+
+    def require_different(self, keys: NDArray[np.int64], subject: Callable[[int], str]) -> None:
+        """Raise DataError for the first row with the key (n,) of an earlier one.
+
+        subject: names what a row is about, given its index.
+        """
+        repeated = first_repeated(keys)
+        if repeated is not None:
+            first, second = repeated
+            self.fail(second, f'{subject(second)} is already given in row {self.lines[first]}')
 
     def fail(self, index: int, cause: str) -> NoReturn:
         """Raise DataError for the row with this index in the block."""

@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import DataError, ErrorsAt
 from ..exposures.frame import MovingPoints
 from ..exposures.names import Names, without_trivial
-from ..exposures.phantom import Phantom, first_repeated
+from ..exposures.phantom import Phantom
 from ..limits import read_limits
 from .access import PathLike
 from .csv_table import Block, NamedColumn, Table, read_all, read_blocks
@@ -46,10 +46,7 @@ def _read(path: PathLike, column: NamedColumn) -> Phantom:
     if len(ids) > max_targets:
         raise DataError(f'{path}: phantoms of more than {max_targets} targets are not read')
     diameters = rows.positive(DIAMETER) if DIAMETER in rows else None
-    repeated = first_repeated(ids)
-    if repeated is not None:
-        first, second = repeated
-        rows.fail(second, f'target {ids[second]} is already given in row {rows.lines[first]}')
+    rows.require_different(ids, lambda row: f'target {ids[row]}')
     with ErrorsAt(path):
         return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters)
 
@@ -77,14 +74,10 @@ def read_moving_points(path: PathLike) -> MovingPoints:
     exposure = rows.ids(EXPOSURE)
     target_id = rows.ids('target_id')
     points = MovingPoints(exposure, target_id, numbers[:, :3], numbers[:, 3])
-    repeated = first_repeated(points.ids(exposure, target_id))
-    if repeated is not None:
-        first, second = repeated
-        rows.fail(
-            second,
-            f'target {target_id[second]} of exposure {exposure[second]} is already given in row '
-            f'{rows.lines[first]}',
-        )
+    rows.require_different(
+        points.ids(exposure, target_id),
+        lambda row: f'target {target_id[row]} of exposure {exposure[row]}',
+    )
     return points
 
 

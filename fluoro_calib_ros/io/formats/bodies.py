@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from ...bodies.joints import JointMotion
 from ...errors import DataError
-from ...exposures.phantom import first_repeated
 from ...photogrammetry.rotations import (
     ROTATION_TOLERANCE,
     matrix_from_quaternion,
@@ -175,14 +174,9 @@ def _read_poses(path: Path, settings: FileSettings) -> Content:
     names = list(dict.fromkeys(body.tolist()))
     frames, row = np.unique(frame, return_inverse=True)
     body_index = np.array([names.index(name) for name in body.tolist()])
-    repeated = first_repeated(row * len(names) + body_index)
-    if repeated is not None:
-        first, second = repeated
-        rows.fail(
-            second,
-            f'exposure {frame[second]} of {body[second]} is already given in row '
-            f'{rows.lines[first]}',
-        )
+    rows.require_different(
+        row * len(names) + body_index, lambda n: f'exposure {frame[n]} of {body[n]}'
+    )
     known = ~np.isnan(values).any(axis=1)
     is_invalid = known & ~(np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < ROTATION_TOLERANCE)
     if is_invalid.any():

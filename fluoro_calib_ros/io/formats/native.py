@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.names import Names, without_trivial
-from ...exposures.phantom import first_repeated
 from ...photogrammetry.rig_orientation import KnownOrientation
 from ..access import PathLike, read_text, write_text
 from ..bags.writer import write_bag
@@ -98,11 +97,9 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
     unknown = np.full(len(frame), np.nan)
     frames, row = np.unique(frame, return_inverse=True)
     targets, column = np.unique(target, return_inverse=True)
-    cell = row * len(targets) + column
-    repeated = first_repeated(cell)
-    if repeated is not None:
-        index = repeated[1]
-        rows.fail(index, f'target {target[index]} of frame {frame[index]} is given twice')
+    rows.require_different(
+        row * len(targets) + column, lambda n: f'target {target[n]} of frame {frame[n]}'
+    )
     shape = (len(frames), len(targets))
 
     def table(values: NDArray[np.float64]) -> NDArray[np.float64]:

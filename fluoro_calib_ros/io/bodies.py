@@ -50,12 +50,13 @@ from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_frames, chec
 from ..bodies.tracking import TrackedExposure
 from ..errors import DataError, ErrorsAt
 from ..exposures.names import Names
+from ..exposures.phantom import first_repeated
 from ..limits import MAX_JOINTS, read_limits
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..reconstruction.intersection import STATUS_NAMES as POINT_STATUS
 from ..reconstruction.reconstruct import ReconstructedFrame
 from .access import PathLike
-from .csv_table import Block, Table, read_blocks
+from .csv_table import Block, Table, read_all
 from .documents import check_keys, numbers_of, read_toml
 
 BODY_COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
@@ -63,40 +64,39 @@ BODY_COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
 
 def read_bodies(path: PathLike) -> tuple[Body, ...]:
     """Read bodies from a CSV file, in file order. Raises DataError that names the row."""
-    rows: dict[str, list[tuple[int, list[float]]]] = {}
-    first_rows: dict[int, tuple[int, str]] = {}
-    max_markers = read_limits().max_targets
-    for block in read_blocks(path, BODY_COLUMNS):
-        unknown = [name for name in block.header if name not in BODY_COLUMNS]
-        if unknown:
-            raise DataError(
-                f'{path}: the column {unknown[0]!r} is unknown, expected one of '
-                f'{",".join(BODY_COLUMNS)}'
+    rows = read_all(path, BODY_COLUMNS)
+    unknown = [name for name in rows.header if name not in BODY_COLUMNS]
+    if unknown:
+        raise DataError(
+            f'{path}: the column {unknown[0]!r} is unknown, expected one of '
+            f'{",".join(BODY_COLUMNS)}'
+        )
+    names = rows.strings('body')
+    markers = rows.ids('marker')
+    numbers = _numbers(rows)
+    if '' in names:
+        rows.fail(names.index(''), 'the body has no name')
+    repeated = first_repeated(markers)
+    if repeated is not None:
+        first, second = repeated
+        marker, name, row = markers[second], names[second], rows.lines[first]
+        cause = f'marker {marker} of {name} is already given in row {row}'
+        if name != names[first]:
+            cause = (
+                f'marker {marker} is one of {names[first]} in row {row} and one of {name} here; '
+                'a marker belongs to one body'
             )
-        names = block.strings('body')
-        markers = block.ids('marker').tolist()
-        for index, values in enumerate(_numbers(block).tolist()):
-            name, marker = names[index], markers[index]
-            if not name:
-                block.fail(index, 'the body has no name')
-            if marker in first_rows:
-                row, owner = first_rows[marker]
-                cause = f'marker {marker} of {name} is already given in row {row}'
-                if name != owner:
-                    cause = (
-                        f'marker {marker} is one of {owner} in row {row} and one of {name} here; '
-                        'a marker belongs to one body'
-                    )
-                block.fail(index, cause)
-            first_rows[marker] = int(block.lines[index]), name
-            rows.setdefault(name, []).append((marker, values))
-        if len(first_rows) > max_markers:
-            raise DataError(f'{path}: bodies of more than {max_markers} markers are not read')
-    bodies = []
-    for name, body_rows in rows.items():
-        values = np.array([numbers for _, numbers in body_rows])
-        target_id = np.array([marker for marker, _ in body_rows])
-        bodies.append(Body(name, target_id, values[:, :3], values[:, 3]))
+        rows.fail(second, cause)
+    max_markers = read_limits().max_targets
+    if len(markers) > max_markers:
+        raise DataError(f'{path}: bodies of more than {max_markers} markers are not read')
+    of_body: dict[str, list[int]] = {}
+    for index, name in enumerate(names):
+        of_body.setdefault(name, []).append(index)
+    bodies = [
+        Body(name, markers[chosen], numbers[chosen, :3], numbers[chosen, 3])
+        for name, chosen in of_body.items()
+    ]
     check_bodies(bodies)
     return tuple(bodies)
 

@@ -20,7 +20,7 @@ from tifffile import TiffFile, TiffFileError
 from ..errors import DataError, ErrorsAt
 from ..images.codec import as_grey, check_size, decode
 from .access import PathLike, check_regular_file, os_error_reason, read_bytes
-from .csv_table import read_blocks
+from .csv_table import read_all
 from .recordings import read_cine_header, read_cine_images, read_dicom_header, read_dicom_images
 
 # Angles of a C-arm in the images of a stack or video, as CSV: `image,angle_deg`.
@@ -37,19 +37,13 @@ def read_image_angles(path: PathLike) -> dict[int, float]:
     Raises DataError for a file that cannot be read, an image that is given twice or has an
     impossible number, and a value that is not an angle. Images with an empty cell are omitted.
     """
-    angles: dict[int, float] = {}
-    rows: dict[int, int] = {}
-    for block in read_blocks(path, COLUMNS):
-        numbers = block.ids('image')
-        block.require('image', numbers > 0, 'the first image is 1')
-        angles_rad = np.radians(block.angles_deg('angle_deg'))
-        for index, (number, angle) in enumerate(zip(numbers.tolist(), angles_rad)):
-            if number in rows:
-                block.fail(index, f'image {number} is already in row {rows[number]}')
-            rows[number] = int(block.lines[index])
-            if not np.isnan(angle):
-                angles[number] = float(angle)
-    return angles
+    rows = read_all(path, COLUMNS)
+    numbers = rows.ids('image')
+    rows.require('image', numbers > 0, 'the first image is 1')
+    angles = np.radians(rows.angles_deg('angle_deg'))
+    rows.require_different(numbers, lambda row: f'image {numbers[row]}')
+    known = ~np.isnan(angles)
+    return dict(zip(numbers[known].tolist(), angles[known].tolist()))
 
 
 # Formats of images, stacks and videos, by file name suffix.

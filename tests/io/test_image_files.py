@@ -618,7 +618,7 @@ def test_images_of_a_video_are_corrected_each_at_its_angle(turning, tmp_path, ca
     'text, cause',
     [
         ('image,angle_deg\n0,3\n', "row 2: image is '0', the first image is 1"),
-        ('image,angle_deg\n1,3\n1,4\n', 'row 3: image 1 is already in row 2'),
+        ('image,angle_deg\n1,3\n1,4\n', 'row 3: image 1 is already given in row 2'),
         ('image,angle_deg\n1,9999\n', "row 2: angle_deg is '9999', not an angle"),
         ('image,angle_deg\n1,x\n', "row 2: angle_deg is 'x', not a number"),
         ('image\n1\n', 'angle_deg'),

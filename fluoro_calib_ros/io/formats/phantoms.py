@@ -142,13 +142,10 @@ def _ids(beads: Block) -> dict[str, int]:
     if 'id' not in beads:
         return {str(number): number for number in range(1, len(beads.rows) + 1)}
     cells = list(map(without_zeros, beads.strings('id')))
-    first_rows: dict[str, int] = {}
-    for index, cell in enumerate(cells):
-        if not cell:
-            beads.fail(index, 'the bead has no id')
-        first = first_rows.setdefault(cell, index)
-        if first != index:
-            beads.fail(index, f'bead {quoted(cell)} is already given in row {beads.lines[first]}')
+    if '' in cells:
+        beads.fail(cells.index(''), 'the bead has no id')
+    codes = np.unique(cells, return_inverse=True)[1]
+    beads.require_different(codes, lambda row: f'bead {quoted(cells[row])}')
     if not all(cell.isascii() and cell.isdigit() for cell in cells):
         return number_names(cells)
     return dict(zip(cells, beads.ids('id').tolist()))

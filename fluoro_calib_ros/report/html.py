@@ -89,12 +89,11 @@ def report_html(report: ReportInput, progress: Callable[[int, int], object] | No
         scale = common_scale(
             (c.model, c.image_size) for c in report.calibrations.values() if c.model.kind != 'none'
         )
-        figures = {name: _figures(report, name, residuals[name], scale) for name in residuals}
         pictures: dict[str, list[tuple[str, str]]] = {name: [] for name in residuals}
         drawn = [
-            (name, *titled_figure)
-            for name, titled_figures in figures.items()
-            for titled_figure in titled_figures
+            (name, title, figure)
+            for name in residuals
+            for title, figure in _figures(report, name, residuals[name], scale)
         ]
         for number, (name, title, figure) in enumerate(drawn):
             if progress is not None:

@@ -145,20 +145,15 @@ def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, 
     if request.exposure is not None:
         raise DataError(f'{source}: --exposure is for a result folder')
     if from_bag:
-        return _bag_content(source, request.angles), True
+        contents = read_frames(source)
+        frames, notes = with_angles(source, contents.frames, request.angles)
+        return Content(observations=frames, notes=(*contents.notes, *notes)), True
     content = registry.read(source, settings, request.source_kind)
     kind = request.source_kind
     if kind is None and source.is_file():
         recognised = registry.recognised(source)
         kind = recognised.kind if recognised else ''
     return content, kind in ('observations', 'phantom', 'points', 'poses', 'grid')
-
-
-def _bag_content(source: Path, angles: AngleOptions) -> Content:
-    """Return the frames of a bag with the angles of the C-arm. Raises DataError."""
-    contents = read_frames(source)
-    frames, notes = with_angles(source, contents.frames, angles)
-    return Content(observations=frames, notes=(*contents.notes, *notes))
 
 
 def _lost_angles(request: ConversionRequest, observations: Frames) -> tuple[str, ...]:

@@ -62,10 +62,14 @@ def run_image_correction(
     workers are lost; and for angles of a folder. `out` is then left unchanged.
     """
     if not request.source.is_dir():
-        if request.angles is not None:
-            return _correct_by_angle(request, request.angles, progress)
-        corrector = ImageCorrector(request.calibration, request.interpolation)
-        return correct_images(request.source, request.out, corrector, progress)
+        if request.angles is None:
+            corrector = ImageCorrector(request.calibration, request.interpolation)
+            return correct_images(request.source, request.out, corrector, progress)
+        angles: Mapping[int, float] = request.angles
+        maps = AngleMaps(request.calibration, request.interpolation)
+        return correct_images(
+            request.source, request.out, lambda number: maps.at(angles.get(number)), progress
+        )
     if request.angles is not None:
         raise DataError(f'{request.source}: angles are those of the images of one file')
     folder = list_images(request.source, request.recursive)
@@ -76,18 +80,6 @@ def run_image_correction(
         if not sum(counts):
             raise DataError(f'none of {len(outcomes)} files can be corrected, {failed[0]}')
     return CorrectedImages('folder', sum(counts), len(counts), folder.passed_over, failed)
-
-
-def _correct_by_angle(
-    request: ImageCorrectionRequest, angles: Mapping[int, float], progress: Progress | None
-) -> CorrectedImages:
-    """Correct the images of a file, each at its angle."""
-    maps = AngleMaps(request.calibration, request.interpolation)
-
-    def corrector(number: int) -> ImageCorrector:
-        return maps.at(angles.get(number))
-
-    return correct_images(request.source, request.out, corrector, progress)
 
 
 def _corrected_files(

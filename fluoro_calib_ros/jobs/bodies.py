@@ -625,7 +625,8 @@ def save_bodies(
     with replaced_folder(directory, BODIES_FOLDER) as folder:
         for name, table in outcome.tables().items():
             table.write(folder / name)
-        if _some_exposure_has_all(outcome.joints):
+        known = [np.isfinite(motion.angles).all(axis=1) for motion in outcome.joints]
+        if known and np.all(known, axis=0).any():  # OpenSim needs the motion of all joints
             write_joint_motion(folder / OPENSIM, outcome.joints, start_ns)
         if report:
             from ..report.motion import bodies_html
@@ -641,9 +642,3 @@ def save_bodies(
             write_text(folder / REPORT, text)
         if film is not None:
             write_films(folder, film, outcome.bodies, outcome.poses)
-
-
-def _some_exposure_has_all(joints: Sequence[JointMotion]) -> bool:
-    """Return whether some exposure has the motion of all joints, as OpenSim requires."""
-    known = [np.isfinite(motion.angles).all(axis=1) for motion in joints]
-    return bool(known) and bool(np.all(known, axis=0).any())

@@ -43,6 +43,7 @@ from .refinements import (
     START_MODES,
     AgreeingOutliers,
     Change,
+    Changes,
     MorePlaces,
     NumberOfSines,
     Once,
@@ -150,10 +151,10 @@ class CollocationTerms(AdjustedTerms):
             return True, coefficients
         solution = self._renewed(network, matrix, adjustment)
         for refinement in self._refinements:
-            change = refinement.propose(solution)
-            if change is not None:
+            changes = refinement.propose(solution)
+            if changes:
                 self._steady_renewals = 0
-                return False, self._changed(change, coefficients)
+                return False, self._changed(changes, coefficients)
         self._steady_renewals = self._steady_renewals + 1 if solution.is_steady else 0
         return solution.is_steady, coefficients
 
@@ -189,17 +190,17 @@ class CollocationTerms(AdjustedTerms):
                     self._steady_renewals = 0
 
     def _changed(
-        self, change: Change, coefficients: Sequence[NDArray[np.float64]]
+        self, changes: Changes, coefficients: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.float64], ...]:
         """Change the terms; return the coefficients to continue with."""
         out = []
-        for part, modes, current in zip(self.parts, change.modes, coefficients):
-            f = part.number
-            part.prior = change.priors.get(f, part.prior)
-            new = part.use_modes(modes, current)
-            if f in change.coefficients:
-                new[part.of_series] = change.coefficients[f]
-            part.own = change.exposure_terms.get(f, part.own)
+        for part, current in zip(self.parts, coefficients):
+            change = changes.get(part.number, Change(part.functions.complete))
+            part.prior = change.prior or part.prior
+            new = part.use_modes(change.modes, current)
+            if change.coefficients is not None:
+                new[part.of_series] = change.coefficients
+            part.own = change.own or part.own
             out.append(np.pad(new, (0, part.count - len(new))))
         return tuple(out)
 

@@ -3,14 +3,14 @@
 """Refinements of a collocation, proposed where a solution shows that its terms do not suffice.
 
 A refinement of one prior proposes another prior for the same functions. A refinement of the terms
-proposes a `Change` of functions, priors and terms of exposures; the network is then adjusted
-again. None means no proposal. `collocation` defines their order.
+proposes a `Change` of functions, prior and terms of exposures for some fluoroscopes; the network
+is then adjusted again. `collocation` defines their order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -53,35 +53,25 @@ class Solution:
     equations: Sequence[SeriesEquations]  #: by fluoroscope, linearised at the solution
     is_steady: bool  #: whether the update changed no prior visibly
 
-    @property
-    def coefficients(self) -> tuple[NDArray[np.float64], ...]:
-        """Coefficients, by fluoroscope."""
-        return coefficients_of(self.adjustment)
-
-    @property
-    def modes(self) -> list[int]:
-        """Number of modes up to which each fluoroscope has all sines."""
-        return [part.functions.complete for part in self.parts]
-
 
 @dataclass(frozen=True)
 class Change:
-    """Terms with which to adjust the network again."""
+    """Terms of a fluoroscope with which to adjust the network again; None: the present ones."""
 
-    modes: Sequence[int]  #: number of modes up to which each fluoroscope gets all sines
-    #: changed priors, by number of the fluoroscope
-    priors: Mapping[int, Prior] = field(default_factory=dict)
-    #: terms of exposures of the fluoroscopes whose distortion varies
-    exposure_terms: Mapping[int, ExposureTerms] = field(default_factory=dict)
-    #: (p,) coefficients of the series to continue with, where they are not those of the solution
-    coefficients: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    modes: int  #: number of modes up to which it gets all sines
+    prior: Prior | None = None
+    own: ExposureTerms | None = None  #: terms of exposures, if its distortion varies
+    coefficients: NDArray[np.float64] | None = None  #: (p,) of the series
+
+
+Changes = Mapping[int, Change]  # by number of the fluoroscope
 
 
 class Refinement(Protocol):
     """A refinement of the terms."""
 
-    def propose(self, solution: Solution) -> Change | None:
-        """Return the change that a solution requires, or None."""
+    def propose(self, solution: Solution) -> Changes:
+        """Return the changes that a solution requires."""
 
 
 class MorePlaces:
@@ -108,20 +98,23 @@ class NumberOfSines:
         self._changes = changes
         self._varying = False
 
-    def propose(self, solution: Solution) -> Change | None:
+    def propose(self, solution: Solution) -> Changes:
         """See `Refinement`."""
         varying = any(part.own is not None for part in solution.parts)
         if varying and not self._varying:  # a variation may have been mistaken for a short signal
             self._changes = 0
         self._varying = varying
-        modes = [
-            self._wanted(part, equations.information)
+        wanted = {
+            part.number: Change(self._wanted(part, equations.information))
             for part, equations in zip(solution.parts, solution.equations)
-        ]
-        if modes == solution.modes or self._changes >= MODE_CHANGES:
-            return None
+        }
+        is_same = all(
+            part.functions.complete == wanted[part.number].modes for part in solution.parts
+        )
+        if is_same or self._changes >= MODE_CHANGES:
+            return {}
         self._changes += 1
-        return Change(modes)
+        return wanted
 
     def _wanted(self, part: FluoroscopeTerms, information: NDArray[np.float64]) -> int:
         """Return the number of modes with which image points can determine the signal.
@@ -146,40 +139,38 @@ class NumberOfSines:
 class Once:
     """A change that is searched for once, at steady priors."""
 
-    def __init__(self, search: Callable[[Solution], Change | None]) -> None:
+    def __init__(self, search: Callable[[Solution], Changes]) -> None:
         self._search = search
         self._is_done = False
 
-    def propose(self, solution: Solution) -> Change | None:
+    def propose(self, solution: Solution) -> Changes:
         """See `Refinement`."""
         if self._is_done or not solution.is_steady:
-            return None
+            return {}
         self._is_done = True
         return self._search(solution)
 
 
-def ripples(solution: Solution) -> Change | None:
+def ripples(solution: Solution) -> Changes:
     """Search for ripples in few bands of frequencies.
 
     They are shown by the residuals, or by what the sines of these bands have already followed
     together with all other sines that are as short.
     """
-    modes = solution.modes
-    priors = {}
-    for part, coefficients in zip(solution.parts, solution.coefficients):
-        f = part.number
+    out = {}
+    for part, coefficients in zip(solution.parts, coefficients_of(solution.adjustment)):
         signal = part.prior.signal
+        modes = part.functions.complete
         points = part.inliers(solution.adjustment)
-        shown = _shown_ripples(part, points, points.residuals, modes[f])
-        if shown is None and modes[f] > GAP_FROM:
+        shown = _shown_ripples(part, points, points.residuals, modes)
+        if shown is None and modes > GAP_FROM:
             shown = _followed_ripples(part, points, coefficients)
-            if shown is not None:
-                signal = signal.without_short_field(max(part.image_size))
-                modes[f] = GAP_FROM
+            signal = signal.without_short_field(max(part.image_size))
+            modes = GAP_FROM
         if shown is not None:
-            signal = replace(signal, ripples=shown)
-            priors[f] = replace(part.prior, signal=signal)
-    return Change(modes, priors) if priors else None
+            prior = replace(part.prior, signal=replace(signal, ripples=shown))
+            out[part.number] = Change(modes, prior)
+    return out
 
 
 def _followed_ripples(
@@ -203,10 +194,12 @@ def _shown_ripples(
     )
 
 
-def exposure_terms(solution: Solution) -> Change | None:
+def exposure_terms(solution: Solution) -> Changes:
     """Return terms of exposures where residuals show that the exposures differ."""
-    terms = {}
+    out = {}
     for part in solution.parts:
+        modes = min(part.functions.complete, START_MODES)
+        out[part.number] = Change(modes)
         functions = exposure_functions(part.uv, part.image_size, part.interior)
         inliers = solution.adjustment.inliers[part.rows]
         shown = variation(
@@ -221,10 +214,9 @@ def exposure_terms(solution: Solution) -> Change | None:
             functions = exposure_functions(
                 part.uv, part.image_size, part.interior, with_interior=True
             )
-        terms[part.number] = ExposureTerms(functions, part.exposure, shown.size_px)
-    if not terms:
-        return None
-    return Change([min(number, START_MODES) for number in solution.modes], exposure_terms=terms)
+        own = ExposureTerms(functions, part.exposure, shown.size_px)
+        out[part.number] = Change(modes, own=own)
+    return out if any(change.own is not None for change in out.values()) else {}
 
 
 class AgreeingOutliers:
@@ -239,32 +231,30 @@ class AgreeingOutliers:
     def __init__(self) -> None:
         self._tried: dict[int, set[int]] = {}
 
-    def propose(self, solution: Solution) -> Change | None:
+    def propose(self, solution: Solution) -> Changes:
         """See `Refinement`."""
+        out: dict[int, Change] = {}
         if not solution.is_steady:
-            return None
-        modes = solution.modes
-        priors = {}
-        coefficients = {}
+            return out
         adjustment = solution.adjustment
-        for part, current in zip(solution.parts, solution.coefficients):
-            f = part.number
+        for part, current in zip(solution.parts, coefficients_of(adjustment)):
             rows = _agreeing(part, adjustment)
-            tried = self._tried.setdefault(f, set())
+            tried = self._tried.setdefault(part.number, set())
             if tried.issuperset(rows.tolist()):
                 continue
             tried.update(rows.tolist())
-            modes[f] = max(LOCAL_MODES, modes[f])
             used = adjustment.inliers[part.rows]
             used[rows] = True
-            priors[f], coefficients[f] = _followed(
+            modes = max(LOCAL_MODES, part.functions.complete)
+            prior, coefficients = _followed(
                 part,
-                modes[f],
+                modes,
                 adjustment.residuals[part.rows] + part.correction(current),
                 used=used,
                 scale=adjustment.noise.scale,
             )
-        return Change(modes, priors, coefficients=coefficients) if priors else None
+            out[part.number] = Change(modes, prior, coefficients=coefficients)
+        return out
 
 
 def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> NDArray[np.int64]:
@@ -306,13 +296,11 @@ def _followed(
     return prior, np.linalg.solve(precision, right)
 
 
-def places(solution: Solution) -> Change | None:
+def places(solution: Solution) -> Changes:
     """Search for places where the signal has a larger variance."""
-    modes = solution.modes
-    priors = {}
+    out = {}
     noise = solution.adjustment.noise
-    for part, coefficients in zip(solution.parts, solution.coefficients):
-        f = part.number
+    for part, coefficients in zip(solution.parts, coefficients_of(solution.adjustment)):
         fine = replace(part.functions, modes=max(LOCAL_MODES, part.functions.modes))
         inliers = solution.adjustment.inliers[part.rows]
         weight = noise.weight(solution.adjustment.q[part.rows][inliers])
@@ -322,6 +310,5 @@ def places(solution: Solution) -> Change | None:
         values = fine(part.uv[inliers])
         prior = with_shown_places(fine, values * root, observed * root, part.prior)
         if prior.local is not None:
-            priors[f] = prior
-            modes[f] = fine.complete
-    return Change(modes, priors) if priors else None
+            out[part.number] = Change(fine.complete, prior)
+    return out

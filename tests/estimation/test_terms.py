@@ -320,14 +320,14 @@ def test_variance_between_exposures_is_that_of_their_terms():
 
 
 class Proposed:
-    """A refinement that proposes one change."""
+    """A refinement that proposes changes once."""
 
-    def __init__(self, change):
-        self.change = change
+    def __init__(self, changes):
+        self.changes = changes
 
     def propose(self, solution):
-        change, self.change = self.change, None
-        return change
+        changes, self.changes = self.changes, {}
+        return changes
 
 
 def test_a_change_of_the_terms_continues_with_the_same_correction():
@@ -337,8 +337,8 @@ def test_a_change_of_the_terms_continues_with_the_same_correction():
     own = ExposureTerms(functions, terms.parts[1].exposure, 0.3)
     signal = Signal(0.3, 222.0)
     given = np.arange(1.0, 1.0 + 2 * len(terms.parts[0].functions_with(4, terms.parts[0].prior)))
-    change = Change([4, 7], {0: Prior(signal, np.ones(22))}, {1: own}, {0: given})
-    terms._refinements = [Proposed(change)]
+    changes = {0: Change(4, Prior(signal, np.ones(22)), coefficients=given), 1: Change(7, own=own)}
+    terms._refinements = [Proposed(changes)]
     fields = [part.correction(c) for part, c in zip(terms.parts, coefficients_of(after))]
     settled, coefficients = terms.renew(varying, matrix, after)
     assert not settled
@@ -361,7 +361,7 @@ def test_terms_of_exposures_stay_where_the_series_is_given_anew():
     varying, after, matrix = solved(network, before, terms)
     present = coefficients_of(after)[0]
     given = np.arange(1.0, 1.0 + 2 * len(part.functions_with(4, part.prior)))
-    terms._refinements = [Proposed(Change([4], coefficients={0: given}))]
+    terms._refinements = [Proposed({0: Change(4, coefficients=given)})]
     _, (coefficients,) = terms.renew(varying, matrix, after)
     end = part.of_series.stop
     assert coefficients[:end].tolist() == given.tolist()
@@ -444,13 +444,13 @@ def many_points(modes):
 def test_ripples_of_residuals_are_proposed_beside_the_complete_sines():
     network, before, terms = many_points(10)
     noise = np.random.default_rng(8).normal(0, 0.1, network.uv.shape)
-    assert ripples(solution_with(terms, network, before, noise)) is None
+    assert not ripples(solution_with(terms, network, before, noise))
     residuals = plane_wave(network.uv, 110.0) + noise
-    change = ripples(solution_with(terms, network, before, residuals))
+    (change,) = ripples(solution_with(terms, network, before, residuals)).values()
     band = 2 * 1.3 * 1024 / 110.0
-    found = change.priors[0].signal.ripples
-    assert min(found.bands) < band < max(found.bands) and list(change.modes) == [10]
-    assert change.priors[0].signal.sd == terms.parts[0].prior.signal.sd
+    found = change.prior.signal.ripples
+    assert min(found.bands) < band < max(found.bands) and change.modes == 10
+    assert change.prior.signal.sd == terms.parts[0].prior.signal.sd
 
 
 def test_ripples_that_sines_have_followed_are_proposed_in_their_place():
@@ -467,10 +467,10 @@ def test_ripples_that_sines_have_followed_are_proposed_in_their_place():
     followed[:, part.functions.trend :][:, long] += rng.normal(0, 40.0, (2, long.sum()))
     residuals = wave - values @ (followed * np.r_[np.ones(part.functions.trend), ~long]).T + noise
     start = solution_with(terms, network, before, residuals, (followed.ravel(),))
-    change = ripples(start)
-    found = change.priors[0].signal
+    (change,) = ripples(start).values()
+    found = change.prior.signal
     band = 2 * 1.3 * 1024 / 110.0
-    assert list(change.modes) == [GAP_FROM]
+    assert change.modes == GAP_FROM
     assert min(found.ripples.bands) < band < max(found.ripples.bands)
     assert len(found.ripples.bands) < 9 and found.fine_sd == pytest.approx(1e-3)
     whole = found.ripples
@@ -490,18 +490,19 @@ def test_a_place_that_residuals_show_is_proposed_with_its_sines():
     network, before, terms = many_points(12)
     part = terms.parts[0]
     noise = np.random.default_rng(10).normal(0, 0.1, network.uv.shape)
-    assert places(solution_with(terms, network, before, noise)) is None
+    assert not places(solution_with(terms, network, before, noise))
     middle = np.median(network.uv, axis=0)
     # The correction already contains a part of the dent.
     values = part.functions(part.uv)
     whole = dent(network.uv, middle, (0.9, -0.6))
     followed = np.linalg.lstsq(values, whole, rcond=1e-6)[0].T
     residuals = whole - values @ followed.T + noise
-    change = places(solution_with(terms, network, before, residuals, (followed.ravel(),)))
-    local = change.priors[0].local
+    changes = places(solution_with(terms, network, before, residuals, (followed.ravel(),)))
+    change = changes[0]
+    local = change.prior.local
     own = local.nodes[local.of_bumps > 0.5 * local.variances.max()]
     assert np.linalg.norm(own.mean(axis=0) - middle) < 80
-    assert list(change.modes) == [LOCAL_MODES]
+    assert change.modes == LOCAL_MODES
 
 
 def test_places_are_looked_for_with_the_weights_of_the_adjustment(monkeypatch):
@@ -510,7 +511,11 @@ def test_places_are_looked_for_with_the_weights_of_the_adjustment(monkeypatch):
     q, sigma = rng.uniform(0, 3, 9), rng.uniform(0.5, 2, 9)
     inside = np.arange(9) != 4
     adjustment = SimpleNamespace(
-        noise=NOISE, q=q[::-1], inliers=inside[::-1], residuals=residuals[::-1]
+        noise=NOISE,
+        q=q[::-1],
+        inliers=inside[::-1],
+        residuals=residuals[::-1],
+        parameters=SimpleNamespace(additional=(0.01,)),
     )
     part = SimpleNamespace(
         number=0,
@@ -528,8 +533,8 @@ def test_places_are_looked_for_with_the_weights_of_the_adjustment(monkeypatch):
         return SimpleNamespace(local=None)
 
     monkeypatch.setattr(refinements, 'with_shown_places', shown)
-    solution = SimpleNamespace(modes=[4], adjustment=adjustment, parts=[part], coefficients=[0.01])
-    assert places(solution) is None
+    solution = SimpleNamespace(adjustment=adjustment, parts=[part])
+    assert not places(solution)
     ((functions, weighted, observed, prior),) = told
     assert functions.modes == LOCAL_MODES and prior == 'given'
     root = np.sqrt(NOISE.weight(q)) / (NOISE.scale * sigma)
@@ -552,24 +557,24 @@ def test_rejected_points_that_agree_are_followed_once():
     near, terms, there = rejected_dent()
     assert not there.adjustment.inliers[near].any()
     refinement = AgreeingOutliers()
-    assert refinement.propose(replace(there, is_steady=False)) is None
-    change = refinement.propose(there)
-    assert list(change.modes) == [LOCAL_MODES]
+    assert refinement.propose(replace(there, is_steady=False)) == {}
+    (change,) = refinement.propose(there).values()
+    assert change.modes == LOCAL_MODES
     part = terms.parts[0]
-    functions = part.functions_with(LOCAL_MODES, change.priors[0])
-    coefficients = change.coefficients[0]
+    functions = part.functions_with(LOCAL_MODES, change.prior)
+    coefficients = change.coefficients
     assert len(coefficients) == 2 * len(functions)
     field = functions(part.uv) @ coefficients.reshape(2, -1).T
     assert np.sqrt(np.mean((field - [3.0, -4.0])[near] ** 2)) < 1.2
     away = np.linalg.norm(part.uv - np.median(part.uv, axis=0), axis=1) > 200
     assert np.sqrt(np.mean(field[away] ** 2)) < 0.3
-    assert refinement.propose(there) is None
+    assert refinement.propose(there) == {}
 
 
 def test_rejected_points_far_beyond_any_correction_are_no_error_of_it():
     """They are off by forty standard deviations."""
     _, _, there = rejected_dent(far=True)
-    assert AgreeingOutliers().propose(there) is None
+    assert AgreeingOutliers().propose(there) == {}
 
 
 def test_what_is_followed_is_the_posterior_with_the_proposed_prior():
@@ -611,16 +616,17 @@ def test_terms_of_exposures_that_follow_an_angle_have_those_of_the_interior():
             rows=np.arange(len(uv)),
             exposure=numbers,
             angles=angles,
+            functions=SimpleNamespace(complete=modes),
         )
         adjustment = SimpleNamespace(inliers=np.ones(len(uv), bool), residuals=residuals)
-        there = SimpleNamespace(parts=[part], adjustment=adjustment, modes=[modes])
-        return refinements.exposure_terms(there)
+        there = SimpleNamespace(parts=[part], adjustment=adjustment)
+        return refinements.exposure_terms(there).get(0)
 
     known = proposed(np.linspace(-1, 1, exposures), 10)
-    assert known.exposure_terms[0].count == 17 * exposures and list(known.modes) == [10]
+    assert known.own.count == 17 * exposures and known.modes == 10
     unknown = proposed(np.full(exposures, np.nan), 40)
-    assert unknown.exposure_terms[0].count == 14 * exposures
-    assert list(unknown.modes) == [START_MODES]
+    assert unknown.own.count == 14 * exposures
+    assert unknown.modes == START_MODES
     assert proposed(np.zeros(0), 40, np.arange(len(uv)) // 13) is None
 
 

@@ -101,6 +101,14 @@ def adjusted(noise_px, **rmse):
     )
 
 
+def values_by_exposure(terms):
+    """Functions (N, 2, p) of ExposureTerms at the image points; those of other exposures are 0."""
+    values, group = terms.functions.values, terms.functions.group
+    out = np.zeros((len(group), 2, terms.exposures, values.shape[2]))
+    out[np.arange(len(group)), :, group] = values
+    return out.reshape(len(group), 2, -1)
+
+
 @functools.cache
 def rig():
     """The virtual rig of the tests."""

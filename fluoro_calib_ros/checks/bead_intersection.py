@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimation.result import CalibrationResult
+from ..estimation.result import CalibrationResult, Targets
 from ..exposures.frame import Frames
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project_with_jacobian
@@ -86,29 +86,27 @@ class Rays:
     exposure: NDArray[np.int64]  #: (n,) running number over all fluoroscopes
 
 
-def intersect(job: CalibrationResult, frames: Frames, phantom: Phantom) -> Beads:
+def intersect(rays: Rays, targets: Targets, phantom: Phantom) -> Beads:
     """Intersect the beads of an adjustment from the images of all its fluoroscopes.
 
     The survey only enters through the orientations, which depend on all beads together. The
     intersection is robust: it first minimises residual lengths, then squares of points that agree.
     """
-    rays = rays_of(job, frames)
     target_id, bead = np.unique(rays.target_id, return_inverse=True)
-    start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target_id)]
+    start = targets.xyz_mm[np.searchsorted(targets.target_id, target_id)]
     return _beads(rays, target_id, bead, start, phantom)
 
 
 def least_chi2_without_a_ray(
-    job: CalibrationResult, frames: Frames, phantom: Phantom, target_id: NDArray[np.int64]
+    rays: Rays, targets: Targets, phantom: Phantom, target_id: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Return the smallest weighted squared misclosures (n,) of beads without one of their rays.
 
     A false match that agrees with the other rays by chance displaces a bead; without this ray the
     bead is in place. The result is zero where too few rays remain.
 
-    job, frames, phantom: as in `intersect`. target_id: (n,) beads. Returns (n,).
+    rays, targets, phantom: as in `intersect`. target_id: (n,) beads. Returns (n,).
     """
-    rays = rays_of(job, frames)
     out = np.zeros(len(target_id))
     for number, target in enumerate(target_id):
         bead_rays = np.flatnonzero(rays.target_id == target)
@@ -116,7 +114,7 @@ def least_chi2_without_a_ray(
         # One copy of the bead for each excluded ray.
         copy, remaining = np.nonzero(~np.eye(count, dtype=bool))
         part = chosen_rows(rays, bead_rays[remaining])
-        start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target)]
+        start = targets.xyz_mm[np.searchsorted(targets.target_id, target)]
         ids = np.full(count, target)
         beads = _beads(part, ids, copy, np.tile(start, (count, 1)), phantom)
         if len(beads.target_id) == count:

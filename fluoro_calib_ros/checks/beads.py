@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -278,17 +279,13 @@ DISTANCES_LIMIT = 1.12
 
 def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     """Compare the beads intersected from all fluoroscopes with their survey."""
-    intersected = intersect(evidence.result, evidence.frames, evidence.phantom)
-    has_trend = any(trend.is_significant for trend in evidence.trends.values())
-
-    def least_chi2(target_id: NDArray[np.int64]) -> NDArray[np.float64]:
-        return least_chi2_without_a_ray(
-            evidence.result, evidence.frames, evidence.phantom, target_id
-        )
-
-    checks = compare_with_survey(intersected, has_trend, least_chi2)
     result = evidence.result
-    exchanged = exchanged_beads(rays_of(result, evidence.frames), result.targets)
+    rays = rays_of(result, evidence.frames)
+    intersected = intersect(rays, result.targets, evidence.phantom)
+    has_trend = any(trend.is_significant for trend in evidence.trends.values())
+    least_chi2 = partial(least_chi2_without_a_ray, rays, result.targets, evidence.phantom)
+    checks = compare_with_survey(intersected, has_trend, least_chi2)
+    exchanged = exchanged_beads(rays, result.targets)
     doubtful = rejected_beads(result.residuals)
     is_wrong = any(check.passed is False for check in checks)
     if len(exchanged) and (not is_wrong or set(checks[0].place.target_id) <= set(exchanged.flat)):

@@ -222,6 +222,13 @@ class Evidence:
         )
 
 
+def for_each(
+    check: Callable[[Evidence, str], Check],
+) -> Callable[[Evidence, Sequence[str]], list[Check]]:
+    """Return a function that makes a check of one fluoroscope for each of several."""
+    return lambda evidence, names: [check(evidence, name) for name in names]
+
+
 def _share_of_inliers(calibration: FluoroscopeCalibration, frames: Sequence[Frame]) -> float:
     return len(calibration.model.train_uv) / sum(len(frame.uv) for frame in frames)
 

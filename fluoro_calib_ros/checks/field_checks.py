@@ -23,7 +23,13 @@ from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import angles_of
 from ..findings import Kind, Place, too_few
 from ..photogrammetry.noise import SURE
-from .calibration_evidence import MIN_VARYING_EXPOSURES, CommonTrend, Evidence, Subject
+from .calibration_evidence import (
+    MIN_VARYING_EXPOSURES,
+    CommonTrend,
+    Evidence,
+    Subject,
+    for_each,
+)
 from .check import Check, more_exposures, too_little_data
 from .comparison import describe_place, difference
 from .residual_tests import RejectedTrend, change_of_trend
@@ -33,12 +39,8 @@ from .residual_tests import RejectedTrend, change_of_trend
 MAX_RATIO = 0.55
 
 
-def check_precision(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Compare the claimed precision of the correction with the noise; a check per fluoroscope."""
-    return [_precision(evidence, name) for name in names]
-
-
-def _precision(evidence: Evidence, name: str) -> Check:
+def check_precision(evidence: Evidence, name: str) -> Check:
+    """Compare the claimed precision of the correction with the noise."""
     trends = evidence.trends[name]
     # Use the noise instead of residuals: these are smaller, as all unknowns follow the noise.
     noise = evidence.calibrations[name].image_sd
@@ -74,18 +76,13 @@ def _redundancy(evidence: Evidence, name: str) -> float:
     return float(np.mean(table.redundancy[(table.fluoroscope == name) & ~table.outlier]))
 
 
-PRECISION = Subject(check_precision)
+PRECISION = Subject(for_each(check_precision))
 
 
 # Maximum harmless change of the distortion, in standard deviations of residuals. In a later
 # exposure the change is an error in addition to its noise, which is larger than residuals: the
 # errors of its points are then up to 8 % larger.
 HARMLESS = 0.45
-
-
-def check_variation(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Fit low-order terms to the residuals of each exposure; return a check per fluoroscope."""
-    return [_variation(evidence, name) for name in names]
 
 
 def _too_few_points(evidence: Evidence, name: str) -> Check:
@@ -100,7 +97,8 @@ def _too_few_points(evidence: Evidence, name: str) -> Check:
     return replace(check, advice='take exposures that show more beads')
 
 
-def _variation(evidence: Evidence, name: str) -> Check:
+def check_variation(evidence: Evidence, name: str) -> Check:
+    """Fit low-order terms to the residuals of each exposure."""
     count = len(evidence.frames[name])
     variation = evidence.variations[name]
     if variation is None:
@@ -141,7 +139,7 @@ def _how_to_give_angles(evidence: Evidence, name: str) -> str:
     return '; or give the angle of the C-arm with each exposure (angle_deg, or joint_states)'
 
 
-VARIATION = Subject(check_variation)
+VARIATION = Subject(for_each(check_variation))
 
 
 LIMIT = 1.9  # predicted sds, from simulated rigs: docs/verdict.md, benchmarks/verdict.py

@@ -35,31 +35,23 @@ def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
     """Return findings for beads with too few rays, and for beads with too acute intersections."""
     has_few_rays = beads.rays < MIN_RAYS
     is_acute = ~has_few_rays & (beads.angle_rad < MIN_ANGLE_RAD)
+    angle = f'{np.rad2deg(MIN_ANGLE_RAD):.0f} degrees'
     out = []
-    if has_few_rays.any():
-        ids = beads.target_id[has_few_rays]
-        out.append(
-            Finding(
-                Kind.FEW_RAYS,
-                f'{len(ids)} beads are not surveyed, fewer than {MIN_RAYS} of their image points '
-                f'agree: {first_few(ids)}',
-                Place(target_id=tuple(ids.tolist()), name=''),
-                severity=Severity.NOTE,
-                numbers={'beads': len(ids)},
+    for kind, is_bad, reason in (
+        (Kind.FEW_RAYS, has_few_rays, f'fewer than {MIN_RAYS} of their image points agree'),
+        (Kind.WEAK_INTERSECTION, is_acute, f'their rays meet at less than {angle}'),
+    ):
+        if is_bad.any():
+            ids = beads.target_id[is_bad]
+            out.append(
+                Finding(
+                    kind,
+                    f'{len(ids)} beads are not surveyed, {reason}: {first_few(ids)}',
+                    Place(target_id=tuple(ids.tolist()), name=''),
+                    severity=Severity.NOTE,
+                    numbers={'beads': len(ids)},
+                )
             )
-        )
-    if is_acute.any():
-        ids = beads.target_id[is_acute]
-        out.append(
-            Finding(
-                Kind.WEAK_INTERSECTION,
-                f'{len(ids)} beads are not surveyed, their rays meet at less than '
-                f'{np.rad2deg(MIN_ANGLE_RAD):.0f} degrees: {first_few(ids)}',
-                Place(target_id=tuple(ids.tolist()), name=''),
-                severity=Severity.NOTE,
-                numbers={'beads': len(ids)},
-            )
-        )
     return out
 
 

@@ -21,6 +21,7 @@ calibration.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -171,9 +172,15 @@ def validate(
     request = replace(request, frames=_used_frames(request.frames, result))
     groups = len(request.groups)
     count = sum(subject.steps * (1 if subject.of_rig else groups) for subject in SUBJECTS)
-    steps = _StepCounter(progress, 1 + count + len(_given_groups(request)))
-    evidence = Evidence(request, calibrations, result, steps.report)
-    steps.report('residuals and beads')
+    total = 1 + count + len(_given_groups(request))
+    number = itertools.count()
+
+    def report(step: str) -> None:
+        if progress is not None:
+            progress(step, next(number), total)
+
+    evidence = Evidence(request, calibrations, result, report)
+    report('residuals and beads')
     checks = []
     for subject in SUBJECTS:
         if subject.of_rig:
@@ -251,21 +258,6 @@ def validate_or_report(
     except DataError as error:
         check = Check(Kind.VALIDATION, f'the validation could not be performed: {error}')
         return Validation('cannot tell', (check,), ids_of(calibrations), 0.0)
-
-
-class _StepCounter:
-    """Reports the steps of a validation with their number and total."""
-
-    def __init__(self, progress: Progress | None, total: int) -> None:
-        self._progress = progress
-        self._total = total
-        self._done = 0
-
-    def report(self, step: str) -> None:
-        """Report a step that begins."""
-        if self._progress is not None:
-            self._progress(step, self._done, self._total)
-        self._done += 1
 
 
 def _used_frames(frames: Frames, result: CalibrationResult) -> dict[str, list[Frame]]:

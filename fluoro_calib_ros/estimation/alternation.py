@@ -36,7 +36,7 @@ from .initial_network import (
     with_additional,
 )
 from .options import CalibrationOptions
-from .rounds import History, Round, SelfCalibration
+from .rounds import History, Round, SelfCalibration, has_settled
 
 # Anderson acceleration of a fixed-point iteration.
 #
@@ -219,7 +219,7 @@ class _Alternation:
         """Whether another round would hardly change the result."""
         scale = self.state.noise.scale
         steady = abs(scale - self.state.after.noise.scale) <= SETTLED * scale
-        return not self.changed and steady and self._history.has_settled(tolerance)
+        return not self.changed and steady and has_settled(self._history.rounds, tolerance)
 
     def accelerate(self) -> None:
         """Replace the values of the next round by those that Anderson acceleration gives."""

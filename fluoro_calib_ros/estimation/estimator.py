@@ -385,24 +385,16 @@ class RegressionStep(ABC, Generic[Model_co]):
         return inliers
 
 
-def no_terms(problem: AdjustmentProblem) -> None:
-    """Estimate no terms in the adjustment."""
-
-
-def no_regression(points: TrainingPoints, k: int | None) -> None:
-    """Fit nothing to the residuals between adjustments."""
-
-
 @dataclass(frozen=True)
 class Estimator:
     """How a self-calibration obtains models of one kind."""
 
     kind: str
     #: returns the terms that are unknowns of the adjustment; None: there are none
-    adjusted_terms: Callable[[AdjustmentProblem], AdjustedTerms | None] = no_terms
+    adjusted_terms: Callable[[AdjustmentProblem], AdjustedTerms] | None = None
     #: returns the regression of the residuals between adjustments with the number k of neighbours
-    #: that the user asks for (None: to be chosen); None: the model needs no regression
-    regression: Callable[[TrainingPoints, int | None], RegressionStep[Any] | None] = no_regression
+    #: that the user asks for (None: to be chosen); None: nothing is fitted to the residuals
+    regression: Callable[[TrainingPoints, int | None], RegressionStep[Any]] | None = None
 
 
 def require_training(count: int) -> None:

@@ -163,14 +163,6 @@ class ExposureTerms:
         return self.functions.count
 
     @property
-    def values(self) -> NDArray[np.float64]:
-        """Functions (N, 2, t e) at the image points; those of other exposures are zero."""
-        functions = self.functions
-        out = np.zeros((len(functions.group), 2, self.exposures, functions.values.shape[2]))
-        out[np.arange(len(functions.group)), :, functions.group] = functions.values
-        return out.reshape(len(functions.group), 2, -1)
-
-    @property
     def precision(self) -> NDArray[np.float64]:
         """Prior precisions (t e,) of the coefficients."""
         return np.tile(1 / self.variance, self.exposures)

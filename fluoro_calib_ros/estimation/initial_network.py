@@ -150,11 +150,10 @@ class Measured:
     @property
     def angles(self) -> list[NDArray[np.float64]]:
         """Angles (e,) of the C-arm [rad] in the exposures of each fluoroscope; NaN: unknown."""
-        network = self.network
-        exposures = [
-            np.unique(network.exposure[network.rows(f)]) for f in range(len(self.fluoroscopes))
+        return [
+            angles_of(self.frames[j] for j in np.flatnonzero(self.network.fluoroscope == f))
+            for f in range(len(self.fluoroscopes))
         ]
-        return [angles_of(self.frames[j] for j in rows) for rows in exposures]
 
 
 @dataclass(frozen=True)

@@ -92,20 +92,14 @@ def orientation_of_known(
         sd_mm, sd_rad = known[name].exterior_sd or (RIGID_SD_MM, RIGID_SD_RAD)
         blocks.append(np.diag(np.repeat([sd_mm**2, sd_rad**2], 3)))
         blocks.append(calibrations[name].interior_covariance)
-    used = [calibrations[name] for name in names]
-    return RigOrientation(
-        fluoroscopes=names,
-        interior=np.array([calibration.interior for calibration in used]),
-        rotation=rotations,
-        position_mm=positions,
-        covariance=block_diag(*blocks),
-        frame_id=FRAME_ID,
-        source='capture',
-        calibration_ids=tuple(calibration.calibration_id for calibration in used),
-        stamp_ns=max(calibration.stamp_ns for calibration in used),
-        exposures=min(calibration.exposures for calibration in used),
-        optical_frame_ids=tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, used)),
-    ).rounded()
+    used = {name: calibrations[name] for name in names}
+    origin = _Origin(
+        FRAME_ID,
+        'capture',
+        max(calibration.stamp_ns for calibration in used.values()),
+        min(calibration.exposures for calibration in used.values()),
+    )
+    return _with_origin(origin, used, (rotations, positions), block_diag(*blocks))
 
 
 def _mean_rotation(figures: FluoroscopeResult) -> NDArray[np.float64]:
@@ -481,7 +475,6 @@ def _orientation(
 ) -> RigOrientation:
     """Return the rig orientation of exteriors, with the uncertainty of the interiors."""
     names = fixed.measured.fluoroscopes
-    known = [calibrations[name] for name in names]
     by_interior = exteriors.by_interior
     mixed = by_interior @ fixed.interiors
     total = exteriors.covariance + mixed @ by_interior.T
@@ -491,16 +484,29 @@ def _orientation(
         [np.r_[6 * f : 6 * f + 6, 6 * count + 3 * f : 6 * count + 3 * f + 3] for f in range(count)]
     )
     covariance = joint[np.ix_(order, order)].reshape(ORIENTATION_SIZE * count, -1)
+    pose = exteriors.rotation, exteriors.position_mm
+    used = {name: calibrations[name] for name in names}
+    return _with_origin(origin, used, pose, (covariance + covariance.T) / 2)
+
+
+def _with_origin(
+    origin: _Origin,
+    calibrations: Calibrations,
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]],
+    covariance: NDArray[np.float64],
+) -> RigOrientation:
+    """Return the orientation of calibrated fluoroscopes; pose: rotations, positions [mm]."""
+    rotation, position_mm = pose
+    known = list(calibrations.values())
     return RigOrientation(
-        fluoroscopes=names,
+        fluoroscopes=tuple(calibrations),
         interior=np.array([calibration.interior for calibration in known]),
-        rotation=exteriors.rotation,
-        position_mm=exteriors.position_mm,
-        covariance=(covariance + covariance.T) / 2,
-        frame_id=origin.frame_id,
-        source=origin.source,
+        rotation=rotation,
+        position_mm=position_mm,
+        covariance=covariance,
         calibration_ids=tuple(calibration.calibration_id for calibration in known),
-        stamp_ns=origin.stamp_ns,
-        exposures=origin.exposures,
-        optical_frame_ids=tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, known)),
+        optical_frame_ids=tuple(
+            c.frame_id or f'{name}_optical' for name, c in calibrations.items()
+        ),
+        **vars(origin),
     ).rounded()

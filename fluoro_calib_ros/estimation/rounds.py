@@ -124,12 +124,9 @@ class History:
         if self._progress is not None:
             self._progress(self.rounds[-1])
 
-    def has_settled(self, tolerance: float) -> bool:
-        """Whether F, G and the correction have stopped changing."""
-        return _has_settled(self.rounds, tolerance)
 
-
-def _has_settled(rounds: Sequence[Round], tolerance: float) -> bool:
+def has_settled(rounds: Sequence[Round], tolerance: float) -> bool:
+    """Whether F, G and the correction have stopped changing."""
     if len(rounds) < 2:
         return False
     last = rounds[-2]

@@ -231,10 +231,10 @@ class _Job:
         self, source: Estimator, progress: Callable[[Round], None] | None
     ) -> SelfCalibration:
         """Self-calibrate with a model by its estimator."""
-        terms = source.adjusted_terms(self.problem)
-        steps = self._regression_steps(source, terms)
-        if steps is None:
+        terms = None if source.adjusted_terms is None else source.adjusted_terms(self.problem)
+        if source.regression is None:
             return self._by_terms(source, terms, progress)
+        steps = self._regression_steps(source.regression, terms)
         return calibrate_by_regression(
             self.measured,
             self.before,
@@ -272,9 +272,11 @@ class _Job:
         )
 
     def _regression_steps(
-        self, source: Estimator, terms: AdjustedTerms | None
-    ) -> dict[str, RegressionStep[CorrectionModel]] | None:
-        """Return the regression step of every fluoroscope, or None for a model that needs none."""
+        self,
+        regression: Callable[[TrainingPoints, int | None], RegressionStep[Any]],
+        terms: AdjustedTerms | None,
+    ) -> dict[str, RegressionStep[CorrectionModel]]:
+        """Return the regression step of every fluoroscope."""
         network = self.measured.network
         steps = {}
         for f, name in enumerate(self.measured.fluoroscopes):
@@ -286,10 +288,7 @@ class _Job:
                 self.gauges[f],
                 None if terms is None else terms.parts[f].values,
             )
-            step = source.regression(points, self.options.k)
-            if step is None:
-                return None
-            steps[name] = step
+            steps[name] = regression(points, self.options.k)
         return steps
 
 

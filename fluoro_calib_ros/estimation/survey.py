@@ -33,6 +33,7 @@ from ..findings import Kind, Place
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.network import Network
 from ..photogrammetry.resection import ROUNDING
+from ..rows import chosen_rows
 from .result import CalibrationResult
 
 # Returns blocks (k, 3, 3) of object points p (k,) with object points q (k,).
@@ -187,14 +188,12 @@ class SurveyedBeads:
     def without(self, target_id: Iterable[int]) -> SurveyedBeads:
         """Return the beads except those with some target ids; the scale does not change."""
         is_kept = ~np.isin(self.target_id, list(target_id))
-        bead_fields = ('target_id', 'xyz_mm', 'covariance', 'given_mm', 'given_sd_mm')
-        names = (*bead_fields, 'rays', 'angle_rad')
         joint = self.joint_covariance
         if joint is not None:
             rows = np.flatnonzero(np.repeat(is_kept, 3))
             joint = joint[np.ix_(rows, rows)]
-        values = {name: getattr(self, name)[is_kept] for name in names}
-        return replace(self, joint_covariance=joint, **values)
+        kept = chosen_rows(replace(self, joint_covariance=None), is_kept)
+        return replace(kept, joint_covariance=joint)
 
     @property
     def off_mm(self) -> NDArray[np.float64]:

@@ -272,7 +272,7 @@ class EliminatePoints(Elimination):
         remaining[rows[a][:, :, None], rows[b][:, None, :]] = equations.coupled
         remaining[rows[b][:, :, None], rows[a][:, None, :]] = equations.coupled.transpose(0, 2, 1)
         if equations.gauge is not None:
-            self._fix_gauge(remaining, equations.gauge.exteriors)
+            self._fix_gauge(remaining, equations.gauge.directions.exteriors)
         return BorderedSystem(equations.pp, border, remaining, *self.right_sides(equations.right))
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -340,7 +340,7 @@ class EliminateExposures(Elimination):
         """Return blocks of cells, bordered by object points and free global unknowns."""
         remaining = self._remaining_matrix(equations.pp, equations.pg, equations)
         if equations.gauge is not None:
-            self._fix_gauge(remaining, equations.gauge.points)
+            self._fix_gauge(remaining, equations.gauge.directions.points)
         return BorderedSystem(
             self._cell_blocks(equations),
             self._cell_border(equations),

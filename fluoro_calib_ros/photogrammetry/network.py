@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,12 +106,22 @@ class Network:
     @cached_property
     def layout(self) -> UnknownLayout:
         """Layout of the unknowns of the network."""
-        return UnknownLayout.of(
-            (self.n_exposures, self.n_points),
-            np.asarray(self.interior_free, dtype=bool),
-            len(self.relative),
-            [0 if a is None else a.count for a in self.additional],
-            DATUM_DEFECT if self.datum == 'inner' else 0,
+        of_interiors = [INTERIOR_SIZE] * self.n_fluoroscopes
+        of_relative = [POSE_SIZE] * len(self.relative)
+        of_additional = [0 if a is None else a.count for a in self.additional]
+        sizes = [*of_interiors, *of_relative, *of_additional]
+        columns = [slice(end - size, end) for size, end in zip(sizes, accumulate(sizes))]
+        first_additional = len(of_interiors) + len(of_relative)
+        interior_free = np.asarray(self.interior_free, dtype=bool)
+        is_other = np.ones(sum(of_relative) + sum(of_additional), dtype=bool)
+        return UnknownLayout(
+            self.n_exposures,
+            self.n_points,
+            interiors=tuple(columns[: len(of_interiors)]),
+            relative=tuple(columns[len(of_interiors) : first_additional]),
+            additional=tuple(columns[first_additional:]),
+            free=np.concatenate([np.repeat(interior_free, INTERIOR_SIZE), is_other]),
+            datum_defect=DATUM_DEFECT if self.datum == 'inner' else 0,
         )
 
     @property
@@ -191,9 +202,7 @@ MIN_RAYS = 3
 class Gauge:
     """Directions that the images do not determine."""
 
-    exteriors: NDArray[np.float64]  #: (m, 6, 7)
-    points: NDArray[np.float64]  #: (n, 3, 7)
-    globals: NDArray[np.float64]  #: (G, 7) changes of the unknowns along the directions
+    directions: UnknownVector  #: 7 columns: changes of the unknowns along the directions
     #: (n, 3, 7) B: directions of the object points at the surveyed coordinates
     constraint: NDArray[np.float64]
 
@@ -222,10 +231,7 @@ def open_gauge(network: Network, parameters: Parameters) -> Gauge | None:
     for columns, pose in zip(network.layout.relative, parameters.relative):
         g[columns][:3, 6] = pose.translation_mm
     return Gauge(
-        e,
-        similarity_directions(parameters.points_mm, centre),
-        g,
-        constraint,
+        UnknownVector(e, similarity_directions(parameters.points_mm, centre), g), constraint
     )
 
 
@@ -296,10 +302,11 @@ class STransformation:
     """
 
     def __init__(self, gauge: Gauge, covariance_times_b: UnknownVector) -> None:
-        inverse = np.linalg.inv(np.einsum('nia,nib->ab', gauge.constraint, gauge.points))
-        self.exteriors = (gauge.exteriors @ inverse, covariance_times_b.exteriors)
-        self.points = (gauge.points @ inverse, covariance_times_b.points)
-        self.globals = (gauge.globals @ inverse, covariance_times_b.globals)
+        e = gauge.directions
+        inverse = np.linalg.inv(np.einsum('nia,nib->ab', gauge.constraint, e.points))
+        self.exteriors = (e.exteriors @ inverse, covariance_times_b.exteriors)
+        self.points = (e.points @ inverse, covariance_times_b.points)
+        self.globals = (e.globals @ inverse, covariance_times_b.globals)
         self._middle = np.einsum('nia,nib->ab', gauge.constraint, covariance_times_b.points)
 
     def transform(

@@ -303,9 +303,8 @@ def resect(
         As robust_dlt, and if no orientation with the targets in front of the source is found.
     """
     projection = robust_dlt(xyz, uv) if projection is None else projection
-    problem = _Problem(xyz, uv, interior)
-    start = _start_orientation(projection, problem)
-    return _refined(problem, *start, tolerance)
+    start = _start_orientation(projection, xyz, uv, interior)
+    return refine_resection(xyz, uv, interior, *start, tolerance)
 
 
 def refine_resection(
@@ -314,12 +313,23 @@ def refine_resection(
     interior: NDArray[np.float64],
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
+    tolerance: float = TOLERANCE,
 ) -> Resection:
     """Refine the exterior orientation of one exposure from initial values (3, 3) and (3,) [mm].
 
     The other arguments and the errors are those of `resect`.
     """
-    return _refined(_Problem(xyz, uv, interior), rotation, position)
+    problem = _Problem(xyz, uv, interior)
+    mu = START_DAMPING
+    for _ in range(100):  # a few are enough
+        system = problem.linearise(rotation, position)
+        rotation, position, step, mu = _damped_step(problem, system, rotation, position, mu)
+        if step @ system.normal @ step <= tolerance * system.noise.scale**2:
+            break
+    noise = system.noise
+    return Resection(
+        rotation, position, noise.scale, noise.inliers(system.squared / noise.scale**2)
+    )
 
 
 def resection_at(
@@ -338,25 +348,6 @@ def resection_at(
     squared = np.where(np.isfinite(squared), squared, np.inf)
     scale = float(np.sqrt(robust_variance(squared)))
     return Resection(rotation, position, scale, Noise(nu=NU).inliers(squared / scale**2))
-
-
-def _refined(
-    problem: _Problem,
-    rotation: NDArray[np.float64],
-    position: NDArray[np.float64],
-    tolerance: float = TOLERANCE,
-) -> Resection:
-    """Refine an exterior orientation. Raises DataError for a target behind the source."""
-    mu = START_DAMPING
-    for _ in range(100):  # a few are enough
-        system = problem.linearise(rotation, position)
-        rotation, position, step, mu = _damped_step(problem, system, rotation, position, mu)
-        if step @ system.normal @ step <= tolerance * system.noise.scale**2:
-            break
-    noise = system.noise
-    return Resection(
-        rotation, position, noise.scale, noise.inliers(system.squared / noise.scale**2)
-    )
 
 
 @dataclass(frozen=True)
@@ -429,7 +420,10 @@ def _damped_step(
 
 
 def _start_orientation(
-    projection: NDArray[np.float64], problem: _Problem
+    projection: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    interior: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotation (3, 3) and position (3,) by a projection matrix and interior orientation.
 
@@ -438,10 +432,10 @@ def _start_orientation(
     about the source until the centre of the targets is imaged at the median image point.
     """
     k, rotation, position = decompose(projection)
-    xp, yp, c = problem.interior
-    centre = problem.xyz.mean(axis=0)
+    xp, yp, c = interior
+    centre = xyz.mean(axis=0)
     position = centre + (position - centre) * c / np.sqrt(k[0, 0] * k[1, 1])
-    pixel = np.median(problem.uv, axis=0)
+    pixel = np.median(uv, axis=0)
     current = rotation @ (centre - position)
     target = np.array([(pixel[0] - xp) / c, (pixel[1] - yp) / c, 1.0])
     current = current / np.linalg.norm(current)

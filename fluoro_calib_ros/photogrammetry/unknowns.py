@@ -127,48 +127,6 @@ class UnknownLayout:
     free: NDArray[np.bool_]  #: (G,) whether each global unknown is estimated
     datum_defect: int  #: number of unknowns that the datum of a free network fixes
 
-    @classmethod
-    def of(
-        cls,
-        shape: tuple[int, int],
-        interior_free: NDArray[np.bool_],
-        n_relative: int,
-        additional_sizes: Sequence[int],
-        datum_defect: int,
-    ) -> UnknownLayout:
-        """Return the layout of the unknowns of a network.
-
-        Parameters
-        ----------
-        shape : (int, int)
-            Numbers of exposures and of object points.
-        interior_free : (F,) ndarray of bool
-            Whether the interior orientation of a fluoroscope is estimated.
-        n_relative : int
-            Number of constrained relative orientations.
-        additional_sizes : sequence of int
-            Numbers of additional parameters of the fluoroscopes.
-        datum_defect : int
-            Number of unknowns that the datum of a free network fixes.
-        """
-        n_fluoroscopes = len(interior_free)
-        sizes = [INTERIOR_SIZE] * n_fluoroscopes
-        sizes += [POSE_SIZE] * n_relative
-        sizes += additional_sizes
-        stops = np.cumsum(sizes, dtype=int)
-        columns = [slice(int(stop - size), int(stop)) for stop, size in zip(stops, sizes)]
-        first_additional = n_fluoroscopes + n_relative
-        free = np.ones(sum(sizes), dtype=bool)
-        free[: INTERIOR_SIZE * n_fluoroscopes] = np.repeat(interior_free, INTERIOR_SIZE)
-        return cls(
-            *shape,
-            tuple(columns[:n_fluoroscopes]),
-            tuple(columns[n_fluoroscopes:first_additional]),
-            tuple(columns[first_additional:]),
-            free,
-            datum_defect,
-        )
-
     @property
     def n_globals(self) -> int:
         """Number G of global unknowns, free or fixed."""

@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from fluoro_calib_ros.checks.bead_intersection import intersect, least_chi2_without_a_ray
+from fluoro_calib_ros.checks.bead_intersection import (
+    intersect,
+    least_chi2_without_a_ray,
+    rays_of,
+)
 from fluoro_calib_ros.correction.base import Correction
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
@@ -93,7 +97,7 @@ def solved(rays, start):
 
 def test_beads_are_those_of_least_squares_of_the_rays_that_agree(scene):
     job, frames, phantom, rays = scene
-    found = intersect(job, frames, phantom)
+    found = intersect(rays_of(job, frames), job.targets, phantom)
     expected = np.delete(100 + np.arange(COUNT), [MOSTLY_FALSE, SELDOM])
     assert found.target_id.tolist() == expected.tolist()
     for row, target in enumerate(expected.tolist()):
@@ -110,7 +114,7 @@ def test_beads_are_those_of_least_squares_of_the_rays_that_agree(scene):
 def test_a_bead_is_tried_without_each_of_its_rays(scene):
     job, frames, phantom, rays = scene
     ids = 100 + np.array([2, FALSE, MOSTLY_FALSE])
-    found = least_chi2_without_a_ray(job, frames, phantom, ids)
+    found = least_chi2_without_a_ray(rays_of(job, frames), job.targets, phantom, ids)
     own = rays[102]
     squares = []
     for left_out in range(len(own)):

@@ -362,7 +362,7 @@ def evidence(claimed=0.1, size=0.0, limit=0.05, sd=0.5, redundancy=0.5):
     ],
 )
 def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise):
-    (found,) = field_checks.check_precision(evidence(**given), ['a'])
+    found = field_checks.check_precision(evidence(**given), 'a')
     assert found.value == pytest.approx(ratio) and found.limit == field_checks.MAX_RATIO
     assert found.numbers['noise_px'] == pytest.approx(noise)
     assert found.numbers['exposures'] == 8
@@ -438,7 +438,7 @@ def test_variation_of_few_points_in_each_exposure_is_not_cured_by_more_exposures
             phantom=Fake(target_id=np.arange(beads)),
             variations={'a': None},
         )
-        (check,) = field_checks.check_variation(evidence, ['a'])
+        check = field_checks.check_variation(evidence, 'a')
         assert check.kind is Kind.VARIATION and check.passed is None
         return check.advice
 
@@ -455,7 +455,7 @@ def test_a_distortion_may_vary_by_a_part_of_the_noise():
         variations={'a': Variation(1.7, 0.21, 0.4)},
         trends={'a': Fake(is_significant=False)},
     )
-    (check,) = field_checks.check_variation(evidence, ['a'])
+    check = field_checks.check_variation(evidence, 'a')
     assert check.value == 0.21 and check.limit == pytest.approx(field_checks.HARMLESS * 0.4)
     assert (check.numbers['chi2_per_dof'], check.numbers['noise_px']) == (1.7, 0.4)
 

@@ -19,6 +19,7 @@ from fluoro_calib_ros.checks.bead_intersection import (
     distances,
     intersect,
     least_chi2_without_a_ray,
+    rays_of,
 )
 from fluoro_calib_ros.checks.beads import compare_with_survey, rejected_beads
 from fluoro_calib_ros.checks.calibration_evidence import Evidence, Subject
@@ -532,9 +533,11 @@ def test_bead_with_a_wrong_survey_is_reported_with_its_error():
     frames = {'a': exposures()['a']}
     job = calibrate(frames, phantom, CalibrationOptions(max_iterations=6, **LOCAL))
     held = adjust_with_calibrations(frames, phantom, job.calibrations)
-    beads, dist = compare_with_survey(intersect(held, frames, phantom))
+    rays = rays_of(held, frames)
+    beads, dist = compare_with_survey(intersect(rays, held.targets, phantom))
     # The bead is displaced whichever ray is excluded.
-    assert least_chi2_without_a_ray(held, frames, phantom, np.array([wrong]))[0] > 100
+    least = least_chi2_without_a_ray(rays, held.targets, phantom, np.array([wrong]))
+    assert least[0] > 100
     assert beads.passed is False and beads.place.target_id == (wrong,)
     assert abs(beads.value - 3.0) < 0.4 and beads.limit < 1.5
     assert dist.passed  # the named bead is excluded
@@ -599,7 +602,7 @@ def test_an_exposure_with_many_false_matches_puts_no_bead_in_doubt(bad):
 def test_errors_of_intersected_beads_agree_with_their_covariance():
     frames = {'a': exposures()['a']}
     held = adjust_with_calibrations(frames, rig().phantom, calibrated('a', **LOCAL).calibrations)
-    beads = intersect(held, frames, rig().phantom)
+    beads = intersect(rays_of(held, frames), held.targets, rig().phantom)
     assert len(beads.target_id) > 350 and 2.5 < np.mean(beads.chi2) < 3.5
     true = rig().true_mm[rig().phantom.index(beads.target_id)]
     error = np.einsum(

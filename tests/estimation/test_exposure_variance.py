@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rigs
+from rigs import values_by_exposure
 
 from fluoro_calib_ros.correction.angle_field import harmonics
 from fluoro_calib_ros.correction.calibration_record import HARMONICS
@@ -79,7 +80,7 @@ def test_terms_that_differ_at_random_have_their_own_size(case):
     ratios = []
     for _ in range(10):
         coefficients = rng.normal(0, np.sqrt(np.tile(terms.variance, terms.exposures)))
-        true = mean_square_left(network, by_exterior, terms.values @ coefficients)
+        true = mean_square_left(network, by_exterior, values_by_exposure(terms) @ coefficients)
         got = variance_between_exposures(network, found, 0, terms, coefficients, exact).mean()
         ratios.append(got / true)
     assert np.mean(ratios) == pytest.approx(1, abs=0.05)
@@ -88,7 +89,9 @@ def test_terms_that_differ_at_random_have_their_own_size(case):
     prior = np.diag(np.tile(terms.variance, terms.exposures))
     got = variance_between_exposures(network, found, 0, terms, np.zeros(terms.count), prior).mean()
     draws = [rng.normal(0, np.sqrt(np.diagonal(prior))) for _ in range(20)]
-    expected = np.mean([mean_square_left(network, by_exterior, terms.values @ c) for c in draws])
+    expected = np.mean(
+        [mean_square_left(network, by_exterior, values_by_exposure(terms) @ c) for c in draws]
+    )
     assert got == pytest.approx(expected, rel=0.1)
 
 
@@ -97,9 +100,9 @@ def test_a_phantom_that_has_shrunk_is_no_variation(case):
     loose = replace(network, survey_sd_mm=np.full(network.n_points, 3.0))
     shrunk = network.survey_mm * [2e-3, -2e-3, 0]
     shift = np.einsum('nak,nk->na', by_point, shrunk[network.point])
-    values = terms.values.reshape(2 * len(shift), -1)
+    values = values_by_exposure(terms).reshape(2 * len(shift), -1)
     coefficients = np.linalg.lstsq(values, shift.ravel(), rcond=None)[0]
-    like_variation = terms.values @ coefficients
+    like_variation = values_by_exposure(terms) @ coefficients
     scale = np.sqrt(np.mean(like_variation**2))
     assert scale > 0.1  # the terms can imitate the shrinkage
     exact = np.zeros((terms.count, terms.count))
@@ -152,7 +155,7 @@ def test_terms_of_exposures_are_found_beside_free_points(case):
     network, found, _, _, terms = case
     rng = np.random.default_rng(2)
     coefficients = rng.normal(0, np.sqrt(np.tile(terms.variance, terms.exposures)))
-    varying = replace(network, uv=network.uv + terms.values @ coefficients)
+    varying = replace(network, uv=network.uv + values_by_exposure(terms) @ coefficients)
     free, surveyed = estimated_size(varying, found.parameters)
     assert free == pytest.approx(SIZE_PX, rel=0.15)
     assert surveyed == pytest.approx(SIZE_PX, rel=0.15)

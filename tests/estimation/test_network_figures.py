@@ -32,8 +32,8 @@ from fluoro_calib_ros.estimation.rounds import (
     History,
     Round,
     SelfCalibration,
-    _has_settled,
     exposures_that_do_not_fit,
+    has_settled,
     outliers_of,
     residuals_of_adjustment,
     statistics_of,
@@ -195,16 +195,16 @@ def test_rounds_settle_where_costs_and_correction_do():
         last = Round(1, cost[0], cost[1], {}, {}, 0.0, 1.0)
         return [last, Round(2, cost[0] + f, cost[1] + g, {}, {}, 0.0, change)]
 
-    assert not _has_settled(rounds()[:1], 1.0)
-    assert _has_settled(rounds(), 1e-4)
+    assert not has_settled(rounds()[:1], 1.0)
+    assert has_settled(rounds(), 1e-4)
     for sign in (-1, 1):
-        assert _has_settled(rounds(f=sign * 0.09), 1e-4)  # relative to the larger of both costs
-        assert not _has_settled(rounds(f=sign * 0.11), 1e-4)
-        assert _has_settled(rounds(g=sign * 0.09), 1e-4)
-        assert not _has_settled(rounds(g=sign * 0.11), 1e-4)
-    assert not _has_settled(rounds(change=2.1e-3), 1e-4)
-    assert _has_settled(rounds(f=0.19, cost=(-2000.0, 1000.0)), 1e-4)
-    assert not _has_settled(rounds(f=0.21, cost=(-2000.0, 1000.0)), 1e-4)
+        assert has_settled(rounds(f=sign * 0.09), 1e-4)  # relative to the larger of both costs
+        assert not has_settled(rounds(f=sign * 0.11), 1e-4)
+        assert has_settled(rounds(g=sign * 0.09), 1e-4)
+        assert not has_settled(rounds(g=sign * 0.11), 1e-4)
+    assert not has_settled(rounds(change=2.1e-3), 1e-4)
+    assert has_settled(rounds(f=0.19, cost=(-2000.0, 1000.0)), 1e-4)
+    assert not has_settled(rounds(f=0.21, cost=(-2000.0, 1000.0)), 1e-4)
 
 
 def test_history_has_the_figures_of_every_round():

@@ -304,13 +304,13 @@ def test_variance_between_exposures_is_that_of_their_terms():
     part = terms.parts[1]
     drawn = rng.normal(0, np.sqrt(np.tile(part.own.variance, part.own.exposures)))
     uv = network.uv.copy()
-    uv[part.rows] += part.own.values @ drawn
+    uv[part.rows] += rigs.values_by_exposure(part.own) @ drawn
     network = replace(network, uv=uv)
     varying, after, _ = solved(network, before, terms)
     precise = precision(varying, after)
     found = terms.parts[1].variance_between_exposures(varying, after, precise)
     assert len(found) == after.inliers[part.rows].sum()
-    assert 0.5 < np.mean(found) / np.mean((part.own.values @ drawn) ** 2) < 1.3
+    assert 0.5 < np.mean(found) / np.mean((rigs.values_by_exposure(part.own) @ drawn) ** 2) < 1.3
     part._angle_fit = SimpleNamespace(remaining=0.25)
     less = terms.parts[1].variance_between_exposures(varying, after, precise)
     np.testing.assert_allclose(less, 0.25 * found)

@@ -170,9 +170,9 @@ def validate(
         known=request.known_orientations,
     )
     request = replace(request, frames=_used_frames(request.frames, result))
-    groups = len(request.groups)
-    count = sum(subject.steps * (1 if subject.of_rig else groups) for subject in SUBJECTS)
-    total = 1 + count + len(_given_groups(request))
+    runs = [(subject, tuple(request.frames)) for subject in SUBJECTS if subject.of_rig]
+    runs += [(s, names) for names in request.groups for s in SUBJECTS if not s.of_rig]
+    total = 1 + sum(subject.steps for subject, _ in runs) + len(_given_groups(request))
     number = itertools.count()
 
     def report(step: str) -> None:
@@ -181,14 +181,7 @@ def validate(
 
     evidence = Evidence(request, calibrations, result, report)
     report('residuals and beads')
-    checks = []
-    for subject in SUBJECTS:
-        if subject.of_rig:
-            checks += subject.run(evidence, tuple(request.frames))
-    for names in request.groups:
-        for subject in SUBJECTS:
-            if not subject.of_rig:
-                checks += subject.run(evidence, names)
+    checks = [check for subject, names in runs for check in subject.run(evidence, names)]
     checks = with_given_interior(evidence, checks)
     # One fluoroscope after the other, then the rig.
     order = [*(name for names in request.groups for name in names), '']

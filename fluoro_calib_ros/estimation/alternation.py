@@ -26,7 +26,12 @@ from ..photogrammetry.network import Network, in_determined_datum
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.outliers import SETTLED, estimate_noise
-from ..photogrammetry.precision import Precision, covariance_blocks, residual_covariance
+from ..photogrammetry.precision import (
+    Precision,
+    covariance_blocks,
+    covariance_of_projection,
+    residual_covariance,
+)
 from .estimator import AdjustedTerms, RegressionStep
 from .initial_network import (
     ROUND_TOLERANCE,
@@ -298,5 +303,6 @@ def _information(
     except np.linalg.LinAlgError:
         raise undetermined(network) from None
     blocks = covariance_blocks(matrix)
-    information = np.linalg.inv(residual_covariance(network, adjustment, blocks))
-    return information, estimate_noise(network, adjustment, blocks)
+    projected = covariance_of_projection(network, adjustment.parameters, blocks)
+    information = np.linalg.inv(residual_covariance(network, adjustment, projected))
+    return information, estimate_noise(network, adjustment, projected)

@@ -37,14 +37,12 @@ from ..photogrammetry.precision import solved_additional
 from .estimator import AdjustedTerms, AdjustmentProblem, coefficients_of
 from .exposure_terms import estimates_beside_free_points
 from .fluoroscope_terms import FluoroscopeTerms
-from .priors import Prior, SeriesEquations, most_likely_prior
+from .priors import Prior
 from .refinements import (
-    SETTLED_PRIOR,
     START_MODES,
     AgreeingOutliers,
     Change,
     Changes,
-    MorePlaces,
     NumberOfSines,
     Once,
     Refinement,
@@ -95,14 +93,12 @@ class CollocationTerms(AdjustedTerms):
     ) -> None:
         self.network = problem.network
         self.parts: list[FluoroscopeTerms] = []
-        self._more_places: list[MorePlaces] = []
         self._steady_renewals = 0
         if earlier is not None:
             self._continue(problem, earlier)
             return
         for f in range(len(problem.image_sizes)):
             self.parts.append(FluoroscopeTerms.first(problem, f, modes))
-            self._more_places.append(MorePlaces())
         self._start = super().start()
         self._refinements: list[Refinement] = [
             NumberOfSines(),
@@ -120,8 +116,6 @@ class CollocationTerms(AdjustedTerms):
             part, coefficients = FluoroscopeTerms.continued(problem, f, series, prior)
             self.parts.append(part)
             start.append(coefficients)
-            # A given prior has already been refined where it was estimated.
-            self._more_places.append(MorePlaces() if prior is None else MorePlaces(0))
         self._start = tuple(start)
         # The ripples of the earlier series stay, and its number of sines is not an initial guess.
         self._refinements = [NumberOfSines(changes=1), AgreeingOutliers()]
@@ -170,8 +164,7 @@ class CollocationTerms(AdjustedTerms):
             part.equations(network, matrix, solution) for part, solution in zip(self.parts, solved)
         ]
         steady = [
-            _renew_prior(part, part_equations, more_places)
-            for part, part_equations, more_places in zip(self.parts, equations, self._more_places)
+            part.renew_prior(part_equations) for part, part_equations in zip(self.parts, equations)
         ]
         return Solution(self.parts, adjustment, equations, all(steady))
 
@@ -203,14 +196,3 @@ class CollocationTerms(AdjustedTerms):
             part.own = change.own or part.own
             out.append(np.pad(new, (0, part.count - len(new))))
         return tuple(out)
-
-
-def _renew_prior(
-    part: FluoroscopeTerms, equations: SeriesEquations, more_places: MorePlaces
-) -> bool:
-    """Update the prior of a fluoroscope; return whether it hardly changes."""
-    last = part.prior
-    prior = most_likely_prior(equations, last)
-    prior = more_places.propose(equations, prior) or prior
-    part.use_prior(prior)
-    return not part.functions.modes or prior.change(last, part.functions) < SETTLED_PRIOR

@@ -44,6 +44,7 @@ from .priors import (
     most_likely_prior,
     prior_precision,
     starting_prior,
+    with_more_places,
 )
 from .ripples import ripples_of
 
@@ -56,6 +57,9 @@ if TYPE_CHECKING:
 RINGS = 2  # radial polynomials of degree 5 and 7, which a curved screen adds at the border
 # Least initial standard deviation [px]: residuals of a detector without distortion are only noise.
 MIN_START_SD_PX = 0.1
+MAX_PLACE_SEARCHES = 4  # most searches for further places
+# Mean change of the log variances of the signal below which no correction changes visibly.
+SETTLED_PRIOR = 0.3
 
 
 class FluoroscopeTerms(TermsOfFluoroscope):
@@ -78,6 +82,7 @@ class FluoroscopeTerms(TermsOfFluoroscope):
         #: terms of the exposures; None: the distortion does not vary
         self.own: ExposureTerms | None = None
         self._angle_fit: AngleFit | None = None
+        self.place_searches = MAX_PLACE_SEARCHES  #: searches for further places that are left
         self._use(functions)
 
     @classmethod
@@ -105,7 +110,11 @@ class FluoroscopeTerms(TermsOfFluoroscope):
         functions, matrix = functions.as_rings(series.coefficients, CUBIC, rings)
         functions, matrix = without_absent_bands(functions, matrix)
         out = cls(problem, number, functions)
-        out.prior = prior or out._prior_of(matrix, problem.before.noise.scale)
+        if prior is not None:  # already refined where it was estimated
+            out.prior = prior
+            out.place_searches = 0
+        else:
+            out.prior = out._prior_of(matrix, problem.before.noise.scale)
         return out, matrix.ravel()
 
     def _prior_of(self, matrix: NDArray[np.float64], scale: float) -> Prior:
@@ -154,10 +163,19 @@ class FluoroscopeTerms(TermsOfFluoroscope):
         self.interior = estimated - (1 - self._relaxation) * offset
         self._offset = offset
 
-    def use_prior(self, prior: Prior) -> None:
-        """Use this prior, and the gauge about the present interior orientation."""
-        self.prior = prior
+    def renew_prior(self, equations: SeriesEquations) -> bool:
+        """Use a more likely prior, and the gauge about the present interior orientation.
+
+        Where the signal has places of larger variance, search for more of them. Returns whether
+        the prior hardly changes.
+        """
+        last = self.prior
+        self.prior = most_likely_prior(equations, last)
+        if self.place_searches and self.prior.local is not None:
+            self.place_searches -= 1
+            self.prior = with_more_places(equations, self.prior)
         self.gauge = self.gauge_of(self.values)
+        return not self.functions.modes or self.prior.change(last, self.functions) < SETTLED_PRIOR
 
     @property
     def count(self) -> int:

@@ -227,7 +227,7 @@ def _held_out_of_terms(
         scaled.reshape(-1, terms.shape[2]),
         (root * values).ravel(),
         np.repeat(fold, 2),
-        lambda gram, right: np.linalg.lstsq(gram, right, rcond=1e-12)[0],
+        lambda gram, right: np.asarray(np.linalg.lstsq(gram, right, rcond=1e-12)[0], dtype=float),
     )
     return predicted.reshape(-1, 2) / root
 

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refinements of a collocation, proposed where a solution shows that its terms do not suffice.
 
-A refinement of one prior proposes another prior for the same functions. A refinement of the terms
-proposes a `Change` of functions, prior and terms of exposures for some fluoroscopes; the network
-is then adjusted again. `collocation` defines their order.
+A refinement of the terms proposes a `Change` of functions, prior and terms of exposures for some
+fluoroscopes; the network is then adjusted again. `collocation` defines their order.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from .estimator import coefficients_of
 from .exposure_terms import ExposureTerms, can_be_fitted, exposure_functions, variation
 from .fluoroscope_terms import FluoroscopeTerms
 from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
-from .priors import Prior, SeriesEquations, prior_precision, with_more_places, with_shown_places
+from .priors import Prior, SeriesEquations, prior_precision, with_shown_places
 from .ripples import Ripples, shown_ripples
 
 START_MODES = 16  # initial number of half waves along the image
@@ -32,15 +31,12 @@ MIN_MODES = 10  # least number of half waves
 LOCAL_MODES = 24
 # Highest band of a smooth field, where a few other bands follow ripples.
 GAP_FROM = 12
-MAX_PLACE_SEARCHES = 4  # most searches for further places
 MAX_MODES = 30  # limits the time, which grows with the sixth power
 # Prior variance times information of a sine below which the image points say nothing about it.
 NEGLIGIBLE = 0.2
 # A smaller number of modes must be below this part of the present one: nearly half the functions.
 FEWER_MODES = 0.75
 MODE_CHANGES = 3  # most changes, so that numbers do not alternate for ever
-# Mean change of the log variances of the signal below which no correction changes visibly.
-SETTLED_PRIOR = 0.3
 MAX_VARYING_EXPOSURES = 60  # exposures of a fluoroscope with terms of their own; limits the time
 
 
@@ -72,20 +68,6 @@ class Refinement(Protocol):
 
     def propose(self, solution: Solution) -> Changes:
         """Return the changes that a solution requires."""
-
-
-class MorePlaces:
-    """Search for further places where the signal has a larger variance."""
-
-    def __init__(self, searches: int = MAX_PLACE_SEARCHES) -> None:
-        self._left = searches
-
-    def propose(self, equations: SeriesEquations, renewed: Prior) -> Prior | None:
-        """Return a prior to replace the updated one, or None."""
-        if not self._left or renewed.local is None:
-            return None
-        self._left -= 1
-        return with_more_places(equations, renewed)
 
 
 class NumberOfSines:

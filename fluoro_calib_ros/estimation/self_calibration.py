@@ -44,7 +44,12 @@ from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network, in_determined_datum
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.outliers import estimate_noise
-from ..photogrammetry.precision import Precision, covariance_blocks, precision
+from ..photogrammetry.precision import (
+    Precision,
+    covariance_blocks,
+    covariance_of_projection,
+    precision,
+)
 from .alternation import Regressions, calibrate_by_regression
 from .collocation import CollocationTerms, EarlierTerms
 from .constraints import gauges_of, interiors_to_estimate, with_constraints
@@ -468,7 +473,8 @@ def adjust_with_terms(
                 network, normal_equations(network, result.parameters, zero, noise, factor)
             )
         blocks = covariance_blocks(matrix)
-        new_noise = estimate_noise(network, result, blocks, matrix.information_factor)
+        projected = covariance_of_projection(network, result.parameters, blocks)
+        new_noise = estimate_noise(network, result, projected, matrix.information_factor)
         converged, coefficients = terms.renew(network, matrix, result)
         converged &= abs(new_noise.scale - noise.scale) <= terms.noise_tolerance * noise.scale
         parameters = replace(result.parameters, additional=coefficients)

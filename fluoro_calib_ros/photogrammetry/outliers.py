@@ -25,11 +25,11 @@ from scipy import special
 
 from .adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust, residuals_and_q
 from .collinearity import project_with_jacobian
-from .elimination import CovarianceBlocks, factorize
+from .elimination import factorize
 from .network import Network
 from .noise import DEFAULT_NOISE, MIN_REDUNDANCY, Noise
 from .normal_equations import MIN_WEIGHT, normal_equations
-from .precision import Precision, covariance_blocks, variance_of_projection
+from .precision import Precision, covariance_blocks, covariance_of_projection
 from .unknowns import Parameters
 
 # Probability of any false alarm among all tests: image points, targets, terms.
@@ -288,7 +288,8 @@ def adjust_and_estimate_noise(
         equations = normal_equations(network, parameters, correction, noise)
         blocks = covariance_blocks(factorize(network, equations, options.elimination))
         last_scale = noise.scale
-        noise = estimate_noise(network, result, blocks)
+        projected = covariance_of_projection(network, parameters, blocks)
+        noise = estimate_noise(network, result, projected)
         if abs(noise.scale - last_scale) <= SETTLED * last_scale:
             settled = True
             break
@@ -320,15 +321,15 @@ def _first_noise(network: Network, squared: NDArray[np.float64], noise: Noise) -
 
 
 def estimate_noise(
-    network: Network, adjustment: Adjustment, blocks: CovarianceBlocks, factor: float = 1.0
+    network: Network, adjustment: Adjustment, projected: NDArray[np.float64], factor: float = 1.0
 ) -> Noise:
     """Estimate the noise model from the residuals of an adjustment and covariances of unknowns.
 
-    factor: information factor near one that the covariances do not include.
+    projected: of these, from covariance_of_projection. factor: information factor near one that
+    they do not include.
     """
     noise = adjustment.noise
     variance = (noise.scale * network.sigma) ** 2
-    unresolved = variance_of_projection(network, adjustment.parameters, blocks)
-    unresolved = unresolved / (factor * variance)
+    unresolved = np.trace(projected, axis1=1, axis2=2) / (factor * variance)
     new = noise.estimate_from(adjustment.q * noise.scale**2, unresolved)
     return replace(new, scale=max(new.scale, MIN_NOISE_PX / float(np.median(network.sigma))))

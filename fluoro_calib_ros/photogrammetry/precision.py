@@ -166,13 +166,6 @@ def covariance_of_projection(
     return out
 
 
-def variance_of_projection(
-    network: Network, parameters: Parameters, blocks: CovarianceBlocks
-) -> NDArray[np.float64]:
-    """Return traces (N,) [px^2] of `covariance_of_projection`."""
-    return np.trace(covariance_of_projection(network, parameters, blocks), axis1=1, axis2=2)
-
-
 def _design(
     network: Network, parameters: Parameters
 ) -> Iterator[tuple[int, slice, NDArray[np.float64]]]:
@@ -263,7 +256,7 @@ def precision(
 
     weighted = blocks_at(1.0)
     projected = covariance_of_projection(network, adjustment.parameters, weighted)
-    residual = residual_covariance(network, adjustment, weighted, projected)
+    residual = residual_covariance(network, adjustment, projected)
     variance = _weighted_variance(network, adjustment)
     redundancy = 1 - np.diagonal(projected, axis1=1, axis2=2) / variance[:, None]
     survey = np.zeros_like(network.survey_mm)
@@ -371,17 +364,12 @@ def _weighted_variance(network: Network, adjustment: Adjustment) -> NDArray[np.f
 
 
 def residual_covariance(
-    network: Network,
-    adjustment: Adjustment,
-    blocks: CovarianceBlocks,
-    projected: NDArray[np.float64] | None = None,
+    network: Network, adjustment: Adjustment, projected: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return covariances C_r (N, 2, 2) [px^2] of the residuals.
 
-    projected: A C_x A^T from covariance_of_projection; None: it is computed.
+    projected: A C_x A^T from covariance_of_projection.
     """
-    if projected is None:
-        projected = covariance_of_projection(network, adjustment.parameters, blocks)
     return _weighted_variance(network, adjustment)[:, None, None] * np.eye(2) - projected
 
 
@@ -398,7 +386,8 @@ def geometric_redundancy(
     equations = normal_equations(network, parameters, 0.0, gaussian)
     blocks = covariance_blocks(factorize(network, equations))
     variance = (noise.scale * network.sigma) ** 2
-    return 1 - variance_of_projection(network, parameters, blocks) / (2 * variance)
+    projected = covariance_of_projection(network, parameters, blocks)
+    return 1 - np.trace(projected, axis1=1, axis2=2) / (2 * variance)
 
 
 # Precision of an adjustment with fixed interior orientations that are not known exactly.

@@ -54,13 +54,7 @@ class VirtualFluoroscope:
 
     def ideal(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the undistorted image points (n, 2) [px] of points (n, 3) in the rig frame."""
-        n = len(points_mm)
-        return project(
-            np.broadcast_to(self.rotation, (n, 3, 3)),
-            np.broadcast_to(self.position_mm, (n, 3)),
-            points_mm,
-            self.interior,
-        )
+        return project(self.rotation, self.position_mm, points_mm, self.interior)
 
 
 @dataclass(frozen=True)

@@ -165,7 +165,7 @@ def test_a_self_calibration_renews_its_terms_of_exposures_until_they_settle(case
     network, found, _, _, true = case
     rng = np.random.default_rng(5)
     coefficients = rng.normal(0, np.sqrt(true.variance), (EXPOSURES, len(true.variance)))
-    network = replace(network, uv=network.uv + true.values @ coefficients.ravel())
+    network = replace(network, uv=network.uv + values_by_exposure(true) @ coefficients.ravel())
     problem = AdjustmentProblem(network, [SIZE], found, (GaugeKind.FULL,))
     terms = CollocationTerms(problem, modes=0)
     terms._refinements = []

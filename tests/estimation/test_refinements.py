@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.correction.series import Functions
+from fluoro_calib_ros.estimation import fluoroscope_terms
 from fluoro_calib_ros.estimation.exposure_terms import exposure_functions
 from fluoro_calib_ros.estimation.priors import Prior, SeriesEquations
 from fluoro_calib_ros.estimation.refinements import (
     MAX_MODES,
     MODE_CHANGES,
     START_MODES,
-    MorePlaces,
     NumberOfSines,
     Once,
     Solution,
@@ -80,11 +80,27 @@ def test_a_change_is_looked_for_once_at_steady_priors():
         assert len(tried) == 1
 
 
-@pytest.mark.parametrize('refinement', [MorePlaces(0), MorePlaces()])
-def test_a_prior_is_not_searched_where_that_is_done_or_nothing_is_there(refinement):
-    """A given prior was refined when it was estimated; without a place, none is next to one."""
-    there = solution()
-    assert refinement.propose(there.equations[0], there.parts[0].prior) is None
+@pytest.mark.parametrize('left, local, searched', [(0, 'a', 0), (4, None, 0), (4, 'a', 1)])
+def test_places_are_searched_only_next_to_others_and_a_few_times(
+    monkeypatch, left, local, searched
+):
+    """A given prior was refined when it was estimated."""
+    tried = []
+    given = SimpleNamespace(local=local, change=lambda last, functions: 0.2)
+    monkeypatch.setattr(fluoroscope_terms, 'most_likely_prior', lambda equations, last: given)
+    monkeypatch.setattr(
+        fluoroscope_terms, 'with_more_places', lambda *found: tried.append(found) or given
+    )
+    part = SimpleNamespace(
+        prior=given,
+        place_searches=left,
+        values=None,
+        gauge_of=lambda values: 'gauge',
+        functions=SimpleNamespace(modes=4),
+    )
+    assert fluoroscope_terms.FluoroscopeTerms.renew_prior(part, 'equations')
+    assert len(tried) == searched and part.place_searches == left - searched
+    assert part.prior is given and part.gauge == 'gauge'
 
 
 @pytest.mark.parametrize('varies', [False, True])

@@ -400,11 +400,7 @@ def test_terms_of_an_earlier_calibration_start_with_its_series():
         np.testing.assert_allclose(part.correction(start), own.predict(part.uv), atol=1e-6)
     assert terms.priors[0] is given and terms.priors[1] is not given
     assert terms.final_tolerance == 1e-3
-    assert [len(terms._more_places), terms._more_places[0]._left, terms._more_places[1]._left] == [
-        2,
-        0,
-        4,
-    ]
+    assert [part.place_searches for part in terms.parts] == [0, 4]
     kinds = [type(one).__name__ for one in terms._refinements]
     assert kinds == ['NumberOfSines', 'AgreeingOutliers', 'Once', 'Once']
     plain = CollocationTerms(

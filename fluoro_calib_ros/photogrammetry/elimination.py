@@ -12,18 +12,21 @@ Exposures that are coupled by a relative orientation are eliminated together. Th
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, cho_factor, cho_solve, lapack
 
+from .collinearity import ALL
 from .network import Gauge, Network, stabilising_factor
 from .normal_equations import NormalEquations
 from .rotations import mirror_lower
-from .unknowns import POINT_SIZE, POSE_SIZE, ReducedLayout, UnknownVector
+from .unknowns import POINT_SIZE, POSE_SIZE, RelativeConstraint, UnknownVector
+
+T = TypeVar('T')
 
 
 @dataclass(frozen=True)
@@ -151,48 +154,160 @@ class CovarianceBlocks:
     points_between: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
 
 
-class Elimination(ABC):
+class Elimination:
     """Order of the unknowns of a network for the solution of its normal equations.
 
-    `layout` is the order of the unknowns that remain after the elimination.
+    Blocks of one kind, exposures or object points, are eliminated; those of the other kind remain,
+    followed by the free global unknowns, in the order of `layout`. Exposures that are eliminated
+    and coupled by a constraint share a cell, that of the exposure of their first fluoroscope, so
+    that their matrix is block-diagonal by cells. `cell` and `place` locate each eliminated block;
+    every cell has `n_places`.
     """
 
-    layout: ReducedLayout
+    eliminates_exposures: bool
 
     def __init__(self, network: Network) -> None:
+        layout = network.layout
         self.network = network
+        self.layout, self.size = layout.without_points, POINT_SIZE
+        count = network.n_points
+        constraints: tuple[RelativeConstraint, ...] = ()
+        if self.eliminates_exposures:
+            self.layout, self.size = layout.without_exposures, POSE_SIZE
+            count = network.n_exposures
+            constraints = network.relative
+        representative = np.arange(count)
+        self.place = np.zeros(count, dtype=int)
+        for number, constraint in enumerate(constraints):
+            a, b = constraint.pairs.T
+            representative[b] = a
+            self.place[b] = number + 1
+        cells, self.cell = np.unique(representative, return_inverse=True)
+        self.n_cells = len(cells)
+        self.n_places = len(constraints) + 1
+        #: places of the blocks among those of all cells
+        self._slot = ALL if self.n_places == 1 else self.cell * self.n_places + self.place
 
-    @abstractmethod
+    def _in_order(self, of_exposures: T, of_points: T) -> tuple[T, T]:
+        """Return what belongs to eliminated and to remaining blocks, or both back by kind."""
+        both = of_exposures, of_points
+        return both if self.eliminates_exposures else both[::-1]
+
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
         """Return the normal equations in the order of this elimination.
 
         Fixed global unknowns are omitted. The undetermined directions of a free network are fixed
         in the part that remains.
         """
+        eliminated, remaining_blocks = self._in_order(equations.ee, equations.pp)
+        own_globals, globals_of_remaining = self._in_order(equations.eg, equations.pg)
+        remaining = self._remaining_matrix(remaining_blocks, globals_of_remaining, equations)
+        if equations.gauge is not None:
+            directions = equations.gauge.directions
+            _, of_remaining = self._in_order(directions.exteriors, directions.points)
+            self._fix_gauge(remaining, of_remaining)
+        return BorderedSystem(
+            self._cell_blocks(eliminated, equations),
+            self._cell_border(own_globals, equations.pe),
+            remaining,
+            *self.right_sides(equations.right),
+        )
 
-    @abstractmethod
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return right sides (k, s, ...) of eliminated and (q, ...) of remaining unknowns."""
+        own, other = self._in_order(right.exteriors, right.points)
+        columns = own.shape[2:]
+        cell_right = np.zeros((self.n_cells * self.n_places, self.size, *columns))
+        cell_right[self._slot] = own
+        remaining = [other.reshape(-1, *columns), right.globals[self.network.layout.free]]
+        return cell_right.reshape(self.n_cells, -1, *columns), np.concatenate(remaining)
 
-    @abstractmethod
     def to_unknowns(
         self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
     ) -> UnknownVector:
         """Return eliminated (k, s, ...) and remaining (q, ...) unknowns by kind."""
+        shape = (*self.layout.block_rows.shape, *x_remaining.shape[1:])
+        other = x_remaining[self.layout.blocks].reshape(shape)
+        x_globals = self.network.layout.expand_globals(x_remaining[self.layout.globals])
+        return UnknownVector(*self._in_order(self._of_blocks(x_blocks), other), x_globals)
 
-    @abstractmethod
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Return covariances by kind of unknown."""
+        remaining_blocks, gg, globals_of_remaining = self._split_remaining(covariance)
+        border = self._of_blocks(covariance.border)
+        gain = self._of_blocks(covariance.gain)
+        pairs, own_globals = self._split_border(border)
+        cell, place, rows = self.cell, self.place, self.layout.block_rows
+        shape = (self.n_cells, self.n_places, self.size)
+        blocks = covariance.blocks.reshape(*shape, *shape[1:])
+        conditional = covariance.conditional.reshape(*shape, *shape[1:])
 
-    def _remaining_right(
-        self, of_blocks: NDArray[np.float64], right: UnknownVector
+        def between(i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
+            same_cell = (cell[i] == cell[j])[:, None, None]
+            fixed = np.where(same_cell, conditional[cell[i], place[i], :, place[j], :], 0.0)
+            count, size, width = border.shape
+            if 2 * len(i) * width < size * count**2:  # too few pairs to multiply all blocks
+                return fixed - border[i] @ gain[j].transpose(0, 2, 1)
+            every = border.reshape(-1, width) @ gain.reshape(-1, width).T
+            return fixed - every.reshape(count, size, count, size)[i, :, j, :]
+
+        def between_remaining(i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
+            return covariance.remaining[rows[i][:, :, None], rows[j][:, None, :]]
+
+        def mixed(e: NDArray[np.int64], p: NDArray[np.int64]) -> NDArray[np.float64]:
+            i, j = self._in_order(e, p)
+            out = pairs[i, :, j, :]
+            return out.transpose(0, 2, 1) if self.eliminates_exposures else out
+
+        ee, pp = self._in_order(blocks[cell, place, :, place, :], remaining_blocks)
+        eg, pg = self._in_order(own_globals, globals_of_remaining)
+        of_exposures, of_points = self._in_order(between, between_remaining)
+        return CovarianceBlocks(
+            ee=ee,
+            pp=pp,
+            gg=gg,
+            eg=eg,
+            pg=pg,
+            pe=mixed,
+            between=of_exposures,
+            points_between=of_points,
+        )
+
+    def _of_blocks(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values of the eliminated blocks from those of their cells (k, s, ...)."""
+        return values.reshape(-1, self.size, *values.shape[2:])[self._slot]
+
+    def _cell_blocks(
+        self, own: NDArray[np.float64], equations: NormalEquations
     ) -> NDArray[np.float64]:
-        """Return the right side (q, ...) of remaining blocks (c, s, ...) and free globals."""
-        blocks = of_blocks.reshape(-1, *of_blocks.shape[2:])
-        return np.concatenate([blocks, right.globals[self.network.layout.free]])
+        """Return blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
+        if self.n_places == 1:
+            return own
+        cell = self.cell
+        place = self.place
+        shape = (self.n_cells, self.n_places, self.size)
+        blocks = np.zeros((*shape, *shape[1:]))
+        diagonal = np.einsum('kiaia->kia', blocks)  # a view
+        diagonal[...] = 1
+        blocks[cell, place, :, place, :] = own
+        a, b = equations.coupled_pairs.T
+        blocks[cell[a], place[a], :, place[b], :] = equations.coupled
+        blocks[cell[a], place[b], :, place[a], :] = equations.coupled.transpose(0, 2, 1)
+        width = self.size * self.n_places
+        return blocks.reshape(self.n_cells, width, width)
 
-    def _globals_of(self, x_remaining: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self.network.layout.expand_globals(x_remaining[self.layout.globals])
+    def _cell_border(
+        self, own_globals: NDArray[np.float64], pe: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return mixed blocks (k, s, q) of the cells with remaining blocks and global unknowns."""
+        own, other = self._in_order(self.network.exposure, self.network.point)
+        border = np.zeros((self.n_cells * self.n_places, self.size, self.layout.size))
+        by_other = border[..., self.layout.blocks]
+        by_other = by_other.reshape(*border.shape[:2], *self.layout.block_rows.shape)
+        slot = self.cell[own] * self.n_places + self.place[own]
+        by_other[slot, :, other, :] = pe.transpose(0, 2, 1) if self.eliminates_exposures else pe
+        border[self._slot, :, self.layout.globals] = own_globals[:, :, self.network.layout.free]
+        return border.reshape(self.n_cells, -1, self.layout.size)
 
     def _remaining_matrix(
         self,
@@ -207,6 +322,10 @@ class Elimination(ABC):
         free = self.network.layout.free
         out = np.zeros((self.layout.size, self.layout.size))
         out[rows[:, :, None], rows[:, None, :]] = remaining_blocks
+        if not self.eliminates_exposures:
+            a, b = (rows[exposures] for exposures in equations.coupled_pairs.T)
+            out[a[:, :, None], b[:, None, :]] = equations.coupled
+            out[b[:, :, None], a[:, None, :]] = equations.coupled.transpose(0, 2, 1)
         out[blocks, border] = own_globals.reshape(rows.size, -1)[:, free]
         out[border, blocks] = out[blocks, border].T
         out[border, border] = equations.gg[np.ix_(free, free)]
@@ -252,180 +371,13 @@ class Elimination(ABC):
 class EliminatePoints(Elimination):
     """Eliminate object points; exposures and global unknowns remain."""
 
-    def __init__(self, network: Network) -> None:
-        super().__init__(network)
-        self.layout = network.layout.without_points
-
-    def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
-        """Return blocks of object points, bordered by exposures and free global unknowns."""
-        network = self.network
-        m = network.n_exposures
-        n = network.n_points
-        free = network.layout.free
-        border = np.zeros((n, POINT_SIZE, self.layout.size))
-        by_exposure = border[:, :, self.layout.blocks].reshape(n, POINT_SIZE, m, POSE_SIZE)
-        by_exposure[network.point, :, network.exposure, :] = equations.pe
-        border[:, :, self.layout.globals] = equations.pg[:, :, free]
-        remaining = self._remaining_matrix(equations.ee, equations.eg, equations)
-        rows = self.layout.block_rows
-        a, b = equations.coupled_pairs.T
-        remaining[rows[a][:, :, None], rows[b][:, None, :]] = equations.coupled
-        remaining[rows[b][:, :, None], rows[a][:, None, :]] = equations.coupled.transpose(0, 2, 1)
-        if equations.gauge is not None:
-            self._fix_gauge(remaining, equations.gauge.directions.exteriors)
-        return BorderedSystem(equations.pp, border, remaining, *self.right_sides(equations.right))
-
-    def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return right sides of points (n, 3, ...), and of exposures and free globals (q, ...)."""
-        return right.points, self._remaining_right(right.exteriors, right)
-
-    def to_unknowns(
-        self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
-    ) -> UnknownVector:
-        """Return object points (n, 3, ...) and remaining unknowns (q, ...) by kind."""
-        exteriors = x_remaining[self.layout.blocks].reshape(-1, POSE_SIZE, *x_remaining.shape[1:])
-        return UnknownVector(exteriors, x_blocks, self._globals_of(x_remaining))
-
-    def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
-        """Return covariances of points from the blocks, of exposures from the remaining part."""
-        rows = self.layout.block_rows
-        ee, gg, eg = self._split_remaining(covariance)
-        pairs, pg = self._split_border(covariance.border)
-
-        def points_between(p: NDArray[np.int64], q: NDArray[np.int64]) -> NDArray[np.float64]:
-            is_same = (p == q)[:, None, None]
-            fixed = np.where(is_same, covariance.conditional[p], 0.0)
-            border, gain = covariance.border, covariance.gain
-            n, size, width = border.shape
-            if 2 * len(p) * width < size * n**2:  # too few pairs to multiply all points
-                return fixed - border[p] @ gain[q].transpose(0, 2, 1)
-            every = border.reshape(-1, width) @ gain.reshape(-1, width).T
-            return fixed - every.reshape(n, size, n, size)[p, :, q, :]
-
-        return CovarianceBlocks(
-            ee=ee,
-            pp=covariance.blocks,
-            gg=gg,
-            eg=eg,
-            pg=pg,
-            pe=lambda e, p: pairs[p, :, e, :],
-            between=lambda e, f: covariance.remaining[rows[e][:, :, None], rows[f][:, None, :]],
-            points_between=points_between,
-        )
+    eliminates_exposures = False
 
 
 class EliminateExposures(Elimination):
-    """Eliminate exposures; object points and global unknowns remain.
+    """Eliminate exposures; object points and global unknowns remain."""
 
-    Exposures coupled by a constraint share a cell, that of the exposure of their first
-    fluoroscope. The normal matrix of the exposures is block-diagonal by cells. `cell` and `place`
-    (m,) locate each exposure; every cell has `n_places`.
-    """
-
-    def __init__(self, network: Network) -> None:
-        super().__init__(network)
-        self.layout = network.layout.without_exposures
-        representative = np.arange(network.n_exposures)
-        place = np.zeros(network.n_exposures, dtype=int)
-        for number, constraint in enumerate(network.relative):
-            a, b = constraint.pairs.T
-            representative[b] = a
-            place[b] = number + 1
-        self.cell = np.unique(representative, return_inverse=True)[1]
-        self.place = place
-        self.n_cells = int(self.cell.max()) + 1
-        self.n_places = len(network.relative) + 1
-
-    def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
-        """Return blocks of cells, bordered by object points and free global unknowns."""
-        remaining = self._remaining_matrix(equations.pp, equations.pg, equations)
-        if equations.gauge is not None:
-            self._fix_gauge(remaining, equations.gauge.directions.points)
-        return BorderedSystem(
-            self._cell_blocks(equations),
-            self._cell_border(equations),
-            remaining,
-            *self.right_sides(equations.right),
-        )
-
-    def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return right sides of cells (k, s, ...), and of points and free globals (q, ...)."""
-        columns = right.exteriors.shape[2:]
-        cell_right = np.zeros((self.n_cells, self.n_places, POSE_SIZE, *columns))
-        cell_right[self.cell, self.place] = right.exteriors
-        cell_right = cell_right.reshape(self.n_cells, -1, *columns)
-        return cell_right, self._remaining_right(right.points, right)
-
-    def _cell_blocks(self, equations: NormalEquations) -> NDArray[np.float64]:
-        """Return blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
-        cell = self.cell
-        place = self.place
-        shape = (self.n_cells, self.n_places, POSE_SIZE)
-        blocks = np.zeros((*shape, *shape[1:]))
-        diagonal = np.einsum('kiaia->kia', blocks)  # a view
-        diagonal[...] = 1
-        blocks[cell, place, :, place, :] = equations.ee
-        a, b = equations.coupled_pairs.T
-        blocks[cell[a], place[a], :, place[b], :] = equations.coupled
-        blocks[cell[a], place[b], :, place[a], :] = equations.coupled.transpose(0, 2, 1)
-        width = POSE_SIZE * self.n_places
-        return blocks.reshape(self.n_cells, width, width)
-
-    def _cell_border(self, equations: NormalEquations) -> NDArray[np.float64]:
-        """Return mixed blocks (k, s, q) of the cells with points and global unknowns."""
-        network = self.network
-        shape = (self.n_cells, self.n_places, POSE_SIZE)
-        border = np.zeros((*shape, self.layout.size))
-        by_point = border[..., self.layout.blocks].reshape(*shape, network.n_points, POINT_SIZE)
-        cell = self.cell[network.exposure]
-        place = self.place[network.exposure]
-        by_point[cell, place, :, network.point, :] = equations.pe.transpose(0, 2, 1)
-        free = network.layout.free
-        border[self.cell, self.place, :, self.layout.globals] = equations.eg[:, :, free]
-        return border.reshape(self.n_cells, POSE_SIZE * self.n_places, -1)
-
-    def to_unknowns(
-        self, x_blocks: NDArray[np.float64], x_remaining: NDArray[np.float64]
-    ) -> UnknownVector:
-        """Return cells (k, s, ...) and remaining unknowns (q, ...) by kind."""
-        points = x_remaining[self.layout.blocks].reshape(-1, POINT_SIZE, *x_remaining.shape[1:])
-        return UnknownVector(self._of_exposures(x_blocks), points, self._globals_of(x_remaining))
-
-    def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
-        """Return covariances of exposures from the cells, of points from the remaining part."""
-        pp, gg, pg = self._split_remaining(covariance)
-        border = self._of_exposures(covariance.border)
-        pairs, eg = self._split_border(border)
-        cell = self.cell
-        place = self.place
-        rows = self.layout.block_rows
-        shape = (self.n_cells, self.n_places, POSE_SIZE)
-        blocks = covariance.blocks.reshape(*shape, *shape[1:])
-        conditional = covariance.conditional.reshape(*shape, *shape[1:])
-        gain = covariance.gain.reshape(*shape, self.layout.size)
-
-        def between(e: NDArray[np.int64], f: NDArray[np.int64]) -> NDArray[np.float64]:
-            same_cell = (cell[e] == cell[f])[:, None, None]
-            fixed = np.where(same_cell, conditional[cell[e], place[e], :, place[f], :], 0.0)
-            return fixed - border[e] @ gain[cell[f], place[f]].transpose(0, 2, 1)
-
-        return CovarianceBlocks(
-            ee=blocks[cell, place, :, place, :],
-            pp=pp,
-            gg=gg,
-            eg=eg,
-            pg=pg,
-            pe=lambda e, p: pairs[e, :, p, :].transpose(0, 2, 1),
-            between=between,
-            points_between=lambda p, q: covariance.remaining[
-                rows[p][:, :, None], rows[q][:, None, :]
-            ],
-        )
-
-    def _of_exposures(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (m, 6, ...) of the exposures from those of their cells (k, s, ...)."""
-        shape = (self.n_cells, self.n_places, POSE_SIZE, *values.shape[2:])
-        return values.reshape(shape)[self.cell, self.place]
+    eliminates_exposures = True
 
 
 def choose_elimination(network: Network) -> type[Elimination]:

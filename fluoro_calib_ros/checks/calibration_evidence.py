@@ -19,7 +19,7 @@ from ..estimation.calibrate import adjust_with_calibrations, calibrate_part
 from ..estimation.exposure_terms import Variation, exposure_functions, is_determined, variation
 from ..estimation.fixed_calibration import noise_of_calibrations
 from ..estimation.initial_network import EarlierCalibration, StartValues
-from ..estimation.lack_of_fit import CELLS
+from ..estimation.lack_of_fit import CELLS, RejectedArea
 from ..estimation.options import AUTO, CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..exposures.frame import Frame, Frames
@@ -27,7 +27,6 @@ from ..exposures.phantom import Phantom
 from .check import Check
 from .residual_tests import (
     RejectedExposure,
-    RejectedTrend,
     Residuals,
     ResidualTrend,
     common_trend,
@@ -56,7 +55,7 @@ class CommonTrend:
     #: size is no fault
     claimed_sd: float
     #: trend of rejected image points; None if there are few everywhere
-    rejected: RejectedTrend | None = None
+    rejected: RejectedArea | None = None
     #: agreement of the rejected image points of one exposure; None if all exposures have few
     of_exposure: RejectedExposure | None = None
 
@@ -109,7 +108,7 @@ class Evidence:
         rejected = residuals.rejected(noise)
         area = rejected_trend(rejected, inliers, size)
         # Do not blame an exposure for distortion that the correction does not follow in an area.
-        if area is not None and area.size > area.limit:
+        if area is not None and area.size_px > area.limit_px:
             rejected = unexplained(rejected, max(size) / CELLS / 2)
         return CommonTrend(
             inliers,

@@ -18,6 +18,7 @@ from ..correction.base import CorrectionModel
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.exposure_terms import MIN_POINTS, VARYING
+from ..estimation.lack_of_fit import RejectedArea
 from ..estimation.options import AUTO
 from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import angles_of
@@ -32,7 +33,7 @@ from .calibration_evidence import (
 )
 from .check import Check, more_exposures, too_little_data
 from .comparison import describe_place, difference
-from .residual_tests import RejectedTrend, change_of_trend
+from .residual_tests import change_of_trend
 
 # Maximum ratio of the standard deviations of the correction and of an image coordinate.
 # Independent errors add in square: this ratio makes them 1.14 times those with known distortion.
@@ -228,7 +229,7 @@ def _advice(requested: str, model: CorrectionModel, count: int) -> str:
 
 def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     rejected = common.rejected
-    if rejected is not None and rejected.size > rejected.limit:
+    if rejected is not None and rejected.size_px > rejected.limit_px:
         return _rejected_area(evidence, name, rejected)
     trend = common.trend
     calibration = evidence.calibrations[name]
@@ -248,21 +249,21 @@ def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     )
 
 
-def _rejected_area(evidence: Evidence, name: str, rejected: RejectedTrend) -> Check:
+def _rejected_area(evidence: Evidence, name: str, rejected: RejectedArea) -> Check:
     """Return the check that fails because rejected image points agree."""
     size = evidence.calibrations[name].image_size
     return Check(
         Kind.WORST_AREA,
-        f'{rejected.points} image points of different exposures were rejected as false matches, '
-        f'but agree with each other: {rejected.size:.3f} px on average at '
+        f'{len(rejected.rows)} image points of different exposures were rejected as false '
+        f'matches, but agree with each other: {rejected.size_px:.3f} px on average at '
         f'{describe_place(rejected.place, size)}',
         Place.at(name, rejected.place),
         'the correction model does not follow the distortion there; '
         f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose a '
         'model with neighbours (--model hybrid)',
-        numbers={'rejected_points': rejected.points},
-        value=rejected.size,
-        limit=rejected.limit,
+        numbers={'rejected_points': len(rejected.rows)},
+        value=rejected.size_px,
+        limit=rejected.limit_px,
         unit='px',
     )
 

@@ -29,6 +29,7 @@ from ..estimation.lack_of_fit import (
     CELLS,
     LARGEST_SD,
     FittedPoints,
+    RejectedArea,
     areas_of_rejected,
 )
 from ..estimation.result import CalibrationResult
@@ -121,16 +122,6 @@ class CellTrend(NamedTuple):
     size: float
     limit: float
     place: NDArray[np.float64]  #: (2,) centre of the cell [px]
-
-
-class RejectedTrend(NamedTuple):
-    """Agreement of the rejected image points near one place."""
-
-    #: length of their mean residual, and the limit that chance hardly exceeds [px]
-    size: float
-    limit: float
-    place: NDArray[np.float64]  #: (2,) mean position [px]
-    points: int  #: number of these points
 
 
 class RejectedExposure(NamedTuple):
@@ -231,19 +222,14 @@ def change_of_trend(residuals: Residuals, image_size: tuple[int, int]) -> Residu
 
 def rejected_trend(
     rejected: Residuals, inliers: Residuals, image_size: tuple[int, int]
-) -> RejectedTrend | None:
+) -> RejectedArea | None:
     """Test whether rejected image points of different exposures agree near some place.
 
     Returns the most significant place, or None if rejected points are few everywhere.
     """
     points = FittedPoints(rejected.uv, rejected.r, rejected.exposure)
     areas = areas_of_rejected(points, rejected.target_id, inliers.uv, image_size)
-    if not areas:
-        return None
-    worst = max(areas, key=lambda area: area.size_px / area.limit_px)
-    return RejectedTrend(
-        worst.size_px, worst.limit_px, rejected.uv[worst.rows].mean(axis=0), len(worst.rows)
-    )
+    return max(areas, key=lambda area: area.size_px / area.limit_px, default=None)
 
 
 def unexplained(rejected: Residuals, reach: float) -> Residuals:

@@ -294,31 +294,20 @@ class RigEvidence:
 
 
 class RecordingDriftWatch(RigDriftWatch):
-    """RigDriftWatch that stores its alarms, as one in the middle of a recording may end.
+    """RigDriftWatch that stores its alarms, as one in the middle of a recording may end."""
 
-    The parameters are those of a RigDriftWatch.
-    """
-
-    def __init__(
-        self,
-        orientation: RigOrientation,
-        image_sizes: Mapping[str, tuple[int, int]],
-        options: DriftOptions | None = None,
-        bodies: Sequence[Body] = (),
-    ) -> None:
-        super().__init__(orientation, image_sizes, options, bodies)
-        self._first_ns: int | None = None
-        self._worst = self.state
-        self._worst_ns = 0
-        self._found_ns = 0
-        self._widest: Finding | None = None
+    _first_ns: int | None = None
+    _worst: DriftState | None = None
+    _worst_ns = 0
+    _found_ns = 0
+    _widest: Finding | None = None
 
     def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
         """Add an exposure as a RigDriftWatch does, and return the state."""
         state = super().add_exposure(stamp_ns, exposure)
         if self._first_ns is None:
             self._first_ns = stamp_ns
-        worst = self._worst
+        worst = self._worst = self._worst or state
         is_worse = (state.level, state.evidence) >= (worst.level, worst.evidence)
         if state is not worst and is_worse:
             if state.level > worst.level:
@@ -335,7 +324,7 @@ class RecordingDriftWatch(RigDriftWatch):
 
     def verdict(self) -> DriftVerdict:
         """Return the verdict on the exposures so far."""
-        worst = self._worst
+        worst = self._worst or self.state
         watched = self.watched_s
         level_at_end = LEVEL_NAMES[self.state.level]
         if worst.level > OK:

@@ -79,11 +79,12 @@ class RejectedArea:
     """Rejected image points of an area.
 
     size_px: length of their mean residual; limit_px: length that false matches hardly exceed in
-    any of the areas; rows: the image points.
+    any of the areas; place (2,): mean position [px]; rows: the image points.
     """
 
     size_px: float
     limit_px: float
+    place: NDArray[np.float64]
     rows: NDArray[np.int64]
 
 
@@ -259,11 +260,13 @@ def _inside(
 class _Area:
     """Rejected image points of an area.
 
-    rows (n,): the image points; of_target (k, 2): mean residual of each target [px]; exposures:
-    number of exposures that agree with the mean of all; clustered: more rejected than by chance.
+    rows (n,): the image points; place (2,): their mean position [px]; of_target (k, 2): mean
+    residual of each target [px]; exposures: number of exposures that agree with the mean of all;
+    clustered: more rejected than by chance.
     """
 
     rows: NDArray[np.int64]
+    place: NDArray[np.float64]
     of_target: NDArray[np.float64]
     exposures: int
     clustered: bool
@@ -278,14 +281,16 @@ class _Area:
         r = rejected.residuals[rows]
         target_means = np.stack([np.bincount(place, r[:, i]) / number for i in (0, 1)], axis=1)
         projected = np.bincount(rejected.exposure[rows], r @ target_means.mean(axis=0))
-        return _Area(rows, target_means, int(np.count_nonzero(projected > 0)), clustered)
+        exposures = int(np.count_nonzero(projected > 0))
+        middle = rejected.uv[rows].mean(axis=0)
+        return _Area(rows, middle, target_means, exposures=exposures, clustered=clustered)
 
     def tested(self, areas: int) -> RejectedArea:
         """Test the mean residual: many residuals of any direction have a Gaussian mean."""
         chance = float(np.sqrt(np.sum(self.of_target**2))) / len(self.of_target)
         false_alarm = CLUSTERED_FALSE_ALARM if self.clustered else FALSE_ALARM
         limit = chance * float(np.sqrt(np.log(areas / false_alarm)))
-        return RejectedArea(self._size(MIN_EXPOSURES), limit, self.rows)
+        return self._with_limit(limit, MIN_EXPOSURES)
 
     def tested_by_draws(self, areas: int) -> RejectedArea:
         """Test the mean of few residuals, by random draws of their directions."""
@@ -293,12 +298,13 @@ class _Area:
         angle = np.random.default_rng(0).uniform(0, 2 * np.pi, (DRAWS, len(length)))
         means = np.abs(np.mean(length * np.exp(1j * angle), axis=1))
         limit = float(np.quantile(means, 1 - CLUSTERED_FALSE_ALARM / areas))
-        return RejectedArea(self._size(FEW_EXPOSURES), limit, self.rows)
+        return self._with_limit(limit, FEW_EXPOSURES)
 
-    def _size(self, exposures: int) -> float:
-        """Return the length of the mean residual [px], 0 if fewer exposures agree."""
+    def _with_limit(self, limit: float, exposures: int) -> RejectedArea:
+        """Return the area with the length of its mean residual, 0 if fewer exposures agree."""
         agree = self.exposures >= exposures
-        return float(np.linalg.norm(self.of_target.mean(axis=0))) if agree else 0.0
+        size = float(np.linalg.norm(self.of_target.mean(axis=0))) if agree else 0.0
+        return RejectedArea(size, limit, self.place, self.rows)
 
 
 def _variance_left_out(

@@ -413,11 +413,11 @@ def test_trends_are_told_with_their_place_and_limit(monkeypatch):
 
 
 def test_rejected_points_that_agree_are_the_worst_area(monkeypatch):
-    rejected = Fake(size=0.8, limit=0.7, place=np.array([100.0, 450.0]), points=17)
+    rejected = Fake(size_px=0.8, limit_px=0.7, place=np.array([100.0, 450.0]), rows=np.arange(17))
     area = trends_of(monkeypatch, rejected=rejected)[1]
     assert (area.value, area.limit, area.numbers) == (0.8, 0.7, {'rejected_points': 17})
     assert 'u 100, v 450' in str(area)
-    rejected.size = 0.6
+    rejected.size_px = 0.6
     assert trends_of(monkeypatch, rejected=rejected)[1].value == 0.5
 
 

@@ -200,11 +200,11 @@ def test_rejected_points_that_agree_are_no_false_matches():
     rng = np.random.default_rng(2)
     others = rejected(np.ones(100))  # image points of the same place that fit
     found = rejected_trend(rejected(rng.normal(1.0, 0.3, 12)), others, SIZE)
-    assert found.size > found.limit and found.points == 12
+    assert found.size_px > found.limit_px and len(found.rows) == 12
     assert np.linalg.norm(found.place - 325) < 25
     for _ in range(20):
         found = rejected_trend(rejected(rng.uniform(0, 2 * np.pi, 12)), others, SIZE)
-        assert found.size <= found.limit
+        assert found.size_px <= found.limit_px
     assert rejected_trend(rejected(np.ones(12), targets=3), others, SIZE) is None
 
 
@@ -213,9 +213,9 @@ def test_few_rejected_points_that_agree_are_enough_where_nearly_all_of_a_place_a
     elsewhere = rejected(np.ones(2000))
     elsewhere = replace(elsewhere, uv=elsewhere.uv / 5)
     found = rejected_trend(few, elsewhere, SIZE)
-    assert found.size > found.limit and found.points == 6
+    assert found.size_px > found.limit_px and len(found.rows) == 6
     found = rejected_trend(few, rejected(np.ones(100)), SIZE)
-    assert found.size <= found.limit
+    assert found.size_px <= found.limit_px
 
 
 def test_rejected_points_of_an_exposure_that_agree_are_no_false_matches():

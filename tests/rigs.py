@@ -26,6 +26,7 @@ from fluoro_calib_ros.io.bags.metadata import (
     message_from_frame,
     observations_topic,
 )
+from fluoro_calib_ros.photogrammetry import elimination
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
@@ -107,6 +108,14 @@ def values_by_exposure(terms):
     out = np.zeros((len(group), 2, terms.exposures, values.shape[2]))
     out[np.arange(len(group)), :, group] = values
     return out.reshape(len(group), 2, -1)
+
+
+@contextlib.contextmanager
+def eliminating(exposures):
+    """Eliminate exposures, or else points, whatever leaves the smaller system."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(elimination, 'eliminates_exposures', lambda network: exposures)
+        yield
 
 
 @functools.cache

@@ -23,7 +23,6 @@ from .elimination import (
     BorderedSystem,
     Elimination,
     FactorizedNormalMatrix,
-    choose_elimination,
 )
 from .network import Network, transform_to_datum
 from .noise import DEFAULT_NOISE, Noise, widening_by_group
@@ -47,9 +46,6 @@ class SolverOptions:
 
     tolerance: float = 1e-8  #: predicted decrease of the cost F at which the iteration ends
     max_steps: int = 100  #: largest number of steps, including refused steps
-    #: unknowns that the solution of the normal equations eliminates; by default the elimination
-    #: that leaves the smaller system
-    elimination: type[Elimination] | None = None
 
 
 DEFAULT_OPTIONS = SolverOptions()
@@ -360,7 +356,7 @@ def adjust_with_matrix(
     relative orientations, and if the steps were damped. Arguments as in `adjust`.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
-    elimination = (options.elimination or choose_elimination(network))(network)
+    elimination = Elimination(network)
     problem = _Problem(network, correction, noise, elimination)
     iteration = _LevenbergMarquardt(problem, start, options.tolerance)
     while not iteration.finished and iteration.steps < options.max_steps:

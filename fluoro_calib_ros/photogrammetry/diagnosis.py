@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from ..findings import Finding, Kind, Place, first_few
-from .elimination import EliminatePoints
+from .elimination import Elimination
 from .network import Network
 from .noise import Noise
 from .normal_equations import normal_equations
@@ -197,7 +197,7 @@ def reduced_normal_matrix(network: Network, parameters: Parameters) -> NDArray[n
     """
     noise = Noise('gaussian', NOMINAL_NOISE_PX / float(np.median(network.sigma)))
     equations = normal_equations(network, parameters, 0.0, noise)
-    elimination = EliminatePoints(network)
+    elimination = Elimination(network, of_exposures=False)
     system = elimination.bordered_system(replace(equations, gauge=None))
     out = system.singular_schur_complement()
     for rows, rotation in zip(elimination.layout.block_rows[:, :3], parameters.rotation):

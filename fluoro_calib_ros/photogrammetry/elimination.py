@@ -154,6 +154,12 @@ class CovarianceBlocks:
     points_between: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
 
 
+def eliminates_exposures(network: Network) -> bool:
+    """Return whether to eliminate exposures, not points: what leaves the smaller system."""
+    layout = network.layout
+    return layout.without_points.blocks.stop >= layout.without_exposures.blocks.stop
+
+
 class Elimination:
     """Order of the unknowns of a network for the solution of its normal equations.
 
@@ -162,17 +168,18 @@ class Elimination:
     and coupled by a constraint share a cell, that of the exposure of their first fluoroscope, so
     that their matrix is block-diagonal by cells. `cell` and `place` locate each eliminated block;
     every cell has `n_places`.
+
+    of_exposures: whether exposures are eliminated; by default what leaves the smaller system.
     """
 
-    eliminates_exposures: bool
-
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: Network, of_exposures: bool | None = None) -> None:
         layout = network.layout
         self.network = network
+        self.of_exposures = eliminates_exposures(network) if of_exposures is None else of_exposures
         self.layout, self.size = layout.without_points, POINT_SIZE
         count = network.n_points
         constraints: tuple[RelativeConstraint, ...] = ()
-        if self.eliminates_exposures:
+        if self.of_exposures:
             self.layout, self.size = layout.without_exposures, POSE_SIZE
             count = network.n_exposures
             constraints = network.relative
@@ -191,7 +198,7 @@ class Elimination:
     def _in_order(self, of_exposures: T, of_points: T) -> tuple[T, T]:
         """Return what belongs to eliminated and to remaining blocks, or both back by kind."""
         both = of_exposures, of_points
-        return both if self.eliminates_exposures else both[::-1]
+        return both if self.of_exposures else both[::-1]
 
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
         """Return the normal equations in the order of this elimination.
@@ -257,7 +264,7 @@ class Elimination:
         def mixed(e: NDArray[np.int64], p: NDArray[np.int64]) -> NDArray[np.float64]:
             i, j = self._in_order(e, p)
             out = pairs[i, :, j, :]
-            return out.transpose(0, 2, 1) if self.eliminates_exposures else out
+            return out.transpose(0, 2, 1) if self.of_exposures else out
 
         ee, pp = self._in_order(blocks[cell, place, :, place, :], remaining_blocks)
         eg, pg = self._in_order(own_globals, globals_of_remaining)
@@ -305,7 +312,7 @@ class Elimination:
         by_other = border[..., self.layout.blocks]
         by_other = by_other.reshape(*border.shape[:2], *self.layout.block_rows.shape)
         slot = self.cell[own] * self.n_places + self.place[own]
-        by_other[slot, :, other, :] = pe.transpose(0, 2, 1) if self.eliminates_exposures else pe
+        by_other[slot, :, other, :] = pe.transpose(0, 2, 1) if self.of_exposures else pe
         border[self._slot, :, self.layout.globals] = own_globals[:, :, self.network.layout.free]
         return border.reshape(self.n_cells, -1, self.layout.size)
 
@@ -322,7 +329,7 @@ class Elimination:
         free = self.network.layout.free
         out = np.zeros((self.layout.size, self.layout.size))
         out[rows[:, :, None], rows[:, None, :]] = remaining_blocks
-        if not self.eliminates_exposures:
+        if not self.of_exposures:
             a, b = (rows[exposures] for exposures in equations.coupled_pairs.T)
             out[a[:, :, None], b[:, None, :]] = equations.coupled
             out[b[:, :, None], a[:, None, :]] = equations.coupled.transpose(0, 2, 1)
@@ -368,26 +375,6 @@ class Elimination:
         return with_blocks.reshape(*shape, *self.layout.block_rows.shape), with_globals
 
 
-class EliminatePoints(Elimination):
-    """Eliminate object points; exposures and global unknowns remain."""
-
-    eliminates_exposures = False
-
-
-class EliminateExposures(Elimination):
-    """Eliminate exposures; object points and global unknowns remain."""
-
-    eliminates_exposures = True
-
-
-def choose_elimination(network: Network) -> type[Elimination]:
-    """Choose the elimination that leaves the smaller system."""
-    layout = network.layout
-    if layout.without_points.blocks.stop < layout.without_exposures.blocks.stop:
-        return EliminatePoints
-    return EliminateExposures
-
-
 @dataclass(frozen=True)
 class FactorizedNormalMatrix:
     """A normal matrix after elimination and Cholesky factorization.
@@ -417,13 +404,11 @@ class FactorizedNormalMatrix:
         )
 
 
-def factorize(
-    network: Network, equations: NormalEquations, elimination: type[Elimination] | None = None
-) -> FactorizedNormalMatrix:
-    """Factorize normal equations; by default with the elimination that leaves the smaller system.
+def factorize(network: Network, equations: NormalEquations) -> FactorizedNormalMatrix:
+    """Factorize normal equations.
 
     Raises numpy.linalg.LinAlgError if the matrix is singular.
     """
-    strategy = (elimination or choose_elimination(network))(network)
-    factor = strategy.bordered_system(equations).factorize()
-    return FactorizedNormalMatrix(strategy, factor, equations.gauge)
+    elimination = Elimination(network)
+    factor = elimination.bordered_system(equations).factorize()
+    return FactorizedNormalMatrix(elimination, factor, equations.gauge)

@@ -286,7 +286,7 @@ def adjust_and_estimate_noise(
         )
         parameters = result.parameters
         equations = normal_equations(network, parameters, correction, noise)
-        blocks = covariance_blocks(factorize(network, equations, options.elimination))
+        blocks = covariance_blocks(factorize(network, equations))
         last_scale = noise.scale
         projected = covariance_of_projection(network, parameters, blocks)
         noise = estimate_noise(network, result, projected)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from .adjustment import Adjustment
 from .collinearity import AdditionalParameters, project_with_jacobian
-from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, factorize
+from .elimination import CovarianceBlocks, FactorizedNormalMatrix, factorize
 from .network import Gauge, Network, STransformation
 from .noise import Noise
 from .normal_equations import CHUNK, MIN_WEIGHT, NormalEquations, normal_equations, right_sides
@@ -235,7 +235,6 @@ def precision(
     network: Network,
     adjustment: Adjustment,
     correction: NDArray[np.float64] | None = None,
-    elimination: type[Elimination] | None = None,
 ) -> Precision:
     """Return covariances and redundancy numbers of an adjustment.
 
@@ -243,8 +242,8 @@ def precision(
     the residuals and the redundancy numbers belong to the weighted least-squares problem at the
     solution.
 
-    correction: (N, 2) correction of the image points [px] in the adjustment. elimination: as in
-    SolverOptions. Raises numpy.linalg.LinAlgError if the network does not determine the unknowns.
+    correction: (N, 2) correction of the image points [px] in the adjustment. Raises
+    numpy.linalg.LinAlgError if the network does not determine the unknowns.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
 
@@ -252,7 +251,7 @@ def precision(
         equations = normal_equations(
             network, adjustment.parameters, correction, adjustment.noise, image_factor
         )
-        return covariance_blocks(factorize(network, equations, elimination))
+        return covariance_blocks(factorize(network, equations))
 
     weighted = blocks_at(1.0)
     projected = covariance_of_projection(network, adjustment.parameters, weighted)

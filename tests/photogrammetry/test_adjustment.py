@@ -24,9 +24,7 @@ from fluoro_calib_ros.photogrammetry.adjustment import (
 )
 from fluoro_calib_ros.photogrammetry.collinearity import AdditionalParameters, project
 from fluoro_calib_ros.photogrammetry.elimination import (
-    EliminateExposures,
-    EliminatePoints,
-    choose_elimination,
+    eliminates_exposures,
 )
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
 from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
@@ -166,15 +164,12 @@ def test_no_better_solution_is_found_by_direct_minimisation(loss):
 )
 def test_both_eliminations_give_the_same_solution_and_covariances(shape, loss):
     network, truth = rigs.small_network(**shape, nu=5.0)
-    smaller = EliminateExposures if shape is MANY_EXPOSURES else EliminatePoints
-    assert choose_elimination(network) is smaller
+    assert eliminates_exposures(network) == (shape is MANY_EXPOSURES)
     found = []
-    for elimination in (EliminatePoints, EliminateExposures):
-        options = SolverOptions(elimination=elimination)
-        result = adjust_and_estimate_noise(
-            network, rigs.disturbed(truth), noise=Noise(loss), options=options
-        )
-        found.append((result, precision(network, result, elimination=elimination)))
+    for of_exposures in (False, True):
+        with rigs.eliminating(of_exposures):
+            result = adjust_and_estimate_noise(network, rigs.disturbed(truth), noise=Noise(loss))
+            found.append((result, precision(network, result)))
     (one, one_precise), (other, other_precise) = found
     assert one.steps == other.steps
     assert one.cost == pytest.approx(other.cost, rel=1e-10)

@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
-from fluoro_calib_ros.photogrammetry.elimination import EliminateExposures, EliminatePoints
 from fluoro_calib_ros.photogrammetry.network import similarity_directions
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
 from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
@@ -171,11 +170,11 @@ def test_both_eliminations_give_the_same_solution_and_covariances(shape, constra
     network = replace(network, datum='inner', relative=(constraint,) if constrained else ())
     start = disturbed(truth) if constrained else replace(rigs.disturbed(truth), relative=())
     found = []
-    for elimination in (EliminatePoints, EliminateExposures):
-        options = SolverOptions(elimination=elimination)
-        result = adjust_and_estimate_noise(network, start, options=options)
+    for of_exposures in (False, True):
+        with rigs.eliminating(of_exposures):
+            result = adjust_and_estimate_noise(network, start)
+            precise = precision(network, result)
         assert result.converged
-        precise = precision(network, result, elimination=elimination)
         redundancy = precise.redundancy.sum() + sum(r.sum() for r in precise.relative_redundancy)
         assert redundancy == pytest.approx(network.n_observations - network.n_unknowns, rel=1e-6)
         found.append((result, precise))

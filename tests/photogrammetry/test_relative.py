@@ -17,7 +17,6 @@ from fluoro_calib_ros.photogrammetry.adjustment import (
     total_cost,
 )
 from fluoro_calib_ros.photogrammetry.collinearity import AdditionalParameters, project
-from fluoro_calib_ros.photogrammetry.elimination import EliminateExposures, EliminatePoints
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
 from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
@@ -201,11 +200,11 @@ def test_both_eliminations_give_the_same_solution_and_covariances(shape, sd):
     )
     start = replace(disturbed(truth), additional=(np.zeros(6), None))
     found = []
-    for elimination in (EliminatePoints, EliminateExposures):
-        options = SolverOptions(elimination=elimination)
-        result = adjust_and_estimate_noise(network, start, options=options)
+    for of_exposures in (False, True):
+        with rigs.eliminating(of_exposures):
+            result = adjust_and_estimate_noise(network, start)
+            found.append((result, precision(network, result)))
         assert result.converged
-        found.append((result, precision(network, result, elimination=elimination)))
     (one, one_precise), (other, other_precise) = found
     sd = np.sqrt(np.diagonal(one_precise.exterior, axis1=1, axis2=2)[:, :3])
     assert np.max(np.abs(one.parameters.position_mm - other.parameters.position_mm) / sd) < 1e-4
@@ -385,11 +384,11 @@ def test_three_fluoroscopes_share_the_first():
         network, uv=uv, relative=(every[0], replace(every[1], pairs=every[1].pairs[1:4]))
     )
     found = []
-    for elimination in (EliminatePoints, EliminateExposures):
-        options = SolverOptions(elimination=elimination)
-        result = adjust_and_estimate_noise(network, disturbed(truth), options=options)
+    for of_exposures in (False, True):
+        with rigs.eliminating(of_exposures):
+            result = adjust_and_estimate_noise(network, disturbed(truth))
+            found.append((result, precision(network, result)))
         assert result.converged
-        found.append((result, precision(network, result, elimination=elimination)))
     (one, one_precise), (two, two_precise) = found
     np.testing.assert_allclose(one.residuals, two.residuals, atol=1e-4)
     for name in ('interior', 'exterior', 'points', 'all_global', 'exterior_global'):

@@ -72,7 +72,7 @@ def compare_with_colmap(exposures: int, repeats: int = 3) -> list[str]:
     network, start = large_network(exposures)
     held = np.arange(len(network.survey_mm)) % HELD_EVERY == 0
     network = with_datum(network, held)
-    ours, seconds = timed(lambda: adjust(network, start, None, NOISE), repeats)
+    ours, seconds = timed(lambda: adjust(network, start, 0.0, NOISE), repeats)
 
     def colmap() -> tuple[ColmapAdjustment, Any]:
         peer = ColmapAdjustment(network, start, NOISE, held, STOP)

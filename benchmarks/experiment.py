@@ -35,7 +35,7 @@ from fluoro_calib_ros.estimation.initial_network import (
 from fluoro_calib_ros.estimation.options import AUTO, CalibrationOptions
 from fluoro_calib_ros.estimation.result import CalibrationResult
 from fluoro_calib_ros.exposures.frame import Frame, points_on_image
-from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
+from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy
@@ -406,11 +406,9 @@ def errors_of_test(
         nu=float(np.median([c.nu for c in calibrations.values()])),
     )
     if too_few_rays_for_noise(network):
-        after = adjust(network, start, correction, noise, SolverOptions(TEST_TOLERANCE))
+        after = adjust(network, start, correction, noise, TEST_TOLERANCE)
     else:
-        after = adjust_and_estimate_noise(
-            network, start, correction, noise, SolverOptions(TEST_TOLERANCE)
-        )
+        after = adjust_and_estimate_noise(network, start, correction, noise, TEST_TOLERANCE)
     exposures = [
         (frame.fluoroscope, frame.number, after.parameters.position_mm[j])
         for j, frame in enumerate(measured.frames)

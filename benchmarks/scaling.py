@@ -49,7 +49,7 @@ def measure(exposures: int) -> dict[str, Any]:
     network, start = large_network(exposures)
     before = peak_gib()
     with threadpool_limits(1):
-        result, seconds = timed(lambda: adjust(network, start, None, NOISE))
+        result, seconds = timed(lambda: adjust(network, start, 0.0, NOISE))
     return {
         'exposures': exposures,
         'targets': len(network.survey_mm),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..correction.base import CorrectionModel
 from ..errors import DataError
-from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.adjustment import Adjustment, adjust
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network, in_determined_datum
 from ..photogrammetry.noise import Noise
@@ -209,7 +209,7 @@ class _Alternation:
             state.after.parameters,
             correction=correction,
             noise=state.noise,
-            options=SolverOptions(ROUND_TOLERANCE),
+            tolerance=ROUND_TOLERANCE,
         )
         information, noise = _information(self._network, after, correction)
         image = regressions.without_gauge(after.residuals + correction, after.parameters.interior)

@@ -345,7 +345,7 @@ def adjust_with_calibrations(
             before, _ = adjusted_with_precision(
                 network,
                 after.parameters,
-                np.zeros_like(correction),
+                0.0,
                 after.noise,
                 tolerance=ROUND_TOLERANCE,  # only the residuals of this adjustment are reported
             )

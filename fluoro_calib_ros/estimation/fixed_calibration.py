@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..exposures.frame import Frame, Frames, angles_of
 from ..exposures.phantom import Phantom
-from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.adjustment import Adjustment, adjust
 from ..photogrammetry.diagnosis import global_names
 from ..photogrammetry.elimination import CovarianceBlocks, factorize
 from ..photogrammetry.network import MIN_RAYS, Network
@@ -256,9 +256,8 @@ def start_within_survey(
     scale = float(np.hypot(noise.scale, np.median(survey_px / network.sigma)))
     while scale > 2 * noise.scale:
         wide_noise = replace(noise, scale=scale)
-        options = SolverOptions(tolerance=ROUND_TOLERANCE)
         adjustment = adjust(
-            network, start, correction=correction, noise=wide_noise, options=options
+            network, start, correction=correction, noise=wide_noise, tolerance=ROUND_TOLERANCE
         )
         start = adjustment.parameters
         scale /= 2

@@ -17,7 +17,7 @@ from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity, too_few
-from ..photogrammetry.adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust
+from ..photogrammetry.adjustment import TOLERANCE, Adjustment, adjust
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.outliers import adjust_and_estimate_noise
@@ -66,9 +66,9 @@ ROUND_TOLERANCE = 1e-4
 def adjusted_with_precision(
     network: Network,
     start: Parameters,
-    correction: NDArray[np.float64],
+    correction: NDArray[np.float64] | float,
     noise: Noise,
-    tolerance: float = DEFAULT_OPTIONS.tolerance,
+    tolerance: float = TOLERANCE,
     noise_fixed: bool = False,
 ) -> tuple[Adjustment, Precision]:
     """Adjust a network and compute its precision.
@@ -78,7 +78,7 @@ def adjusted_with_precision(
     network : Network
     start : Parameters
         Initial values of the unknowns.
-    correction : (N, 2) ndarray
+    correction : (N, 2) ndarray or float
         Corrections of the image points [px], fixed.
     noise : Noise
         Initial values of the noise model, or the noise model itself with noise_fixed.
@@ -94,9 +94,7 @@ def adjusted_with_precision(
     """
     adjusted = adjust if noise_fixed else adjust_and_estimate_noise
     try:
-        result = adjusted(
-            network, start, correction=correction, noise=noise, options=SolverOptions(tolerance)
-        )
+        result = adjusted(network, start, correction=correction, noise=noise, tolerance=tolerance)
         return result, precision(network, result, correction)
     except np.linalg.LinAlgError:
         raise undetermined(network) from None

@@ -34,9 +34,8 @@ from ..correction.series import Series
 from ..errors import DataError
 from ..findings import Place
 from ..photogrammetry.adjustment import (
-    DEFAULT_OPTIONS,
+    TOLERANCE,
     Adjustment,
-    SolverOptions,
     adjust_with_matrix,
     residuals_and_q,
 )
@@ -307,9 +306,9 @@ def _adjusted_without_correction(
         before, precise = adjusted_with_precision(
             measured.network,
             measured.start,
-            correction=np.zeros_like(measured.network.uv),
+            correction=0.0,
             noise=start_noise(options.loss),
-            tolerance=DEFAULT_OPTIONS.tolerance if is_result else FINAL_TOLERANCE,
+            tolerance=TOLERANCE if is_result else FINAL_TOLERANCE,
         )
     except DataError as error:
         raise DataError(undetermined_unknowns(measured) or error.finding) from None
@@ -445,7 +444,6 @@ def adjust_with_terms(
     converged. Raises LinAlgError if the network does not determine the unknowns.
     """
     correction = np.zeros_like(plain.uv)
-    zero = correction
     parameters = with_additional(before, terms.start()).parameters
     noise = before.noise
     converged = False
@@ -458,9 +456,8 @@ def adjust_with_terms(
         result, matrix = adjust_with_matrix(
             network,
             parameters,
-            correction=zero,
             noise=noise,
-            options=SolverOptions(tolerance),
+            tolerance=tolerance,
         )
         last = correction
         correction = network.additional_correction(result.parameters)
@@ -470,7 +467,7 @@ def adjust_with_terms(
         factor = noise.information_factor(result.q)
         if matrix is None or factor < NEARLY_ONE or terms.needs_solution:
             matrix = factorize(
-                network, normal_equations(network, result.parameters, zero, noise, factor)
+                network, normal_equations(network, result.parameters, 0.0, noise, factor)
             )
         blocks = covariance_blocks(matrix)
         projected = covariance_of_projection(network, result.parameters, blocks)

@@ -38,17 +38,8 @@ REPEATED = 0.5
 # Largest decrease of F for each image point by a step with the last normal matrix: larger steps
 # change the weights of the image points.
 REPEATED_DECREASE = 0.01
-
-
-@dataclass(frozen=True)
-class SolverOptions:
-    """Options of the adjustment."""
-
-    tolerance: float = 1e-8  #: predicted decrease of the cost F at which the iteration ends
-    max_steps: int = 100  #: largest number of steps, including refused steps
-
-
-DEFAULT_OPTIONS = SolverOptions()
+TOLERANCE = 1e-8  # predicted decrease of the cost F at which an adjustment ends
+MAX_STEPS = 100  # largest number of steps of an adjustment, including refused steps
 
 
 @dataclass(frozen=True)
@@ -150,7 +141,7 @@ class _Problem:
     """Minimisation problem: the cost of a network for a correction and a noise model."""
 
     network: Network
-    correction: NDArray[np.float64]
+    correction: NDArray[np.float64] | float
     noise: Noise
     elimination: Elimination
 
@@ -312,9 +303,9 @@ class _LevenbergMarquardt:
 def adjust(
     network: Network,
     start: Parameters,
-    correction: NDArray[np.float64] | None = None,
+    correction: NDArray[np.float64] | float = 0.0,
     noise: Noise = DEFAULT_NOISE,
-    options: SolverOptions = DEFAULT_OPTIONS,
+    tolerance: float = TOLERANCE,
 ) -> Adjustment:
     """Adjust a network for a given noise model.
 
@@ -323,43 +314,43 @@ def adjust(
     network : Network
     start : Parameters
         Initial values.
-    correction : (N, 2) ndarray, optional
+    correction : (N, 2) ndarray or float
         Correction of the image points [px], excluding the additional parameters.
     noise : Noise
         Noise model; it is fixed.
-    options : SolverOptions
+    tolerance : float
+        Predicted decrease of the cost F at which the iteration ends.
 
     Returns
     -------
     Adjustment
-        `converged` is False if `max_steps` ended the iteration or no step was found.
+        `converged` is False if MAX_STEPS ended the iteration or no step was found.
     """
     return adjust_with_matrix(
         network,
         start,
         correction=correction,
         noise=noise,
-        options=options,
+        tolerance=tolerance,
     )[0]
 
 
 def adjust_with_matrix(
     network: Network,
     start: Parameters,
-    correction: NDArray[np.float64] | None = None,
+    correction: NDArray[np.float64] | float = 0.0,
     noise: Noise = DEFAULT_NOISE,
-    options: SolverOptions = DEFAULT_OPTIONS,
+    tolerance: float = TOLERANCE,
 ) -> tuple[Adjustment, FactorizedNormalMatrix | None]:
     """Adjust a network; also return the normal matrix of the last steps.
 
     The matrix belongs to parameters near the solution. It is None for a free network, with
     relative orientations, and if the steps were damped. Arguments as in `adjust`.
     """
-    correction = np.zeros_like(network.uv) if correction is None else correction
     elimination = Elimination(network)
     problem = _Problem(network, correction, noise, elimination)
-    iteration = _LevenbergMarquardt(problem, start, options.tolerance)
-    while not iteration.finished and iteration.steps < options.max_steps:
+    iteration = _LevenbergMarquardt(problem, start, tolerance)
+    while not iteration.finished and iteration.steps < MAX_STEPS:
         iteration.step()
     solution = iteration.current
     adjustment = Adjustment(

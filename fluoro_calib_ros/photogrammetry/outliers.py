@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from .adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust, residuals_and_q
+from .adjustment import TOLERANCE, Adjustment, adjust, residuals_and_q
 from .collinearity import project_with_jacobian
 from .elimination import factorize
 from .network import Network
@@ -257,23 +257,21 @@ MIN_CORE = 0.25
 def adjust_and_estimate_noise(
     network: Network,
     start: Parameters,
-    correction: NDArray[np.float64] | None = None,
+    correction: NDArray[np.float64] | float = 0.0,
     noise: Noise = DEFAULT_NOISE,
-    options: SolverOptions = DEFAULT_OPTIONS,
+    tolerance: float = TOLERANCE,
 ) -> Adjustment:
     """Adjust a network and estimate its noise model; see `adjust` for the arguments.
 
-    noise: loss and initial values of the noise model. options: of the last adjustment; earlier
-    adjustments have a looser tolerance.
+    noise: loss and initial values of the noise model. tolerance: of the last adjustment; earlier
+    adjustments have a looser one.
 
     `converged` of the result is False if adjustment or scale did not settle; `steps` counts the
     last adjustment only. Raises LinAlgError if the network does not determine the unknowns.
     """
-    correction = np.zeros_like(network.uv) if correction is None else correction
     _, q = residuals_and_q(network, start, correction, noise)
     if np.isfinite(q).all():
         noise = _first_noise(network, q * noise.scale**2, noise)
-    loose_options = replace(options, tolerance=LOOSE)
     parameters = start
     settled = False
     for _ in range(40):  # a few are enough
@@ -282,7 +280,7 @@ def adjust_and_estimate_noise(
             parameters,
             correction=correction,
             noise=noise,
-            options=loose_options,
+            tolerance=LOOSE,
         )
         parameters = result.parameters
         equations = normal_equations(network, parameters, correction, noise)
@@ -298,7 +296,7 @@ def adjust_and_estimate_noise(
         parameters,
         correction=correction,
         noise=noise,
-        options=options,
+        tolerance=tolerance,
     )
     return replace(result, converged=result.converged and settled)
 

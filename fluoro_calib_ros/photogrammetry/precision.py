@@ -234,7 +234,7 @@ def _mixed_covariance(
 def precision(
     network: Network,
     adjustment: Adjustment,
-    correction: NDArray[np.float64] | None = None,
+    correction: NDArray[np.float64] | float = 0.0,
 ) -> Precision:
     """Return covariances and redundancy numbers of an adjustment.
 
@@ -245,7 +245,6 @@ def precision(
     correction: (N, 2) correction of the image points [px] in the adjustment. Raises
     numpy.linalg.LinAlgError if the network does not determine the unknowns.
     """
-    correction = np.zeros_like(network.uv) if correction is None else correction
 
     def blocks_at(image_factor: float) -> CovarianceBlocks:
         equations = normal_equations(

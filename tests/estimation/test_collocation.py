@@ -70,7 +70,6 @@ from fluoro_calib_ros.estimation.signal import (
     spectral_density,
 )
 from fluoro_calib_ros.photogrammetry.adjustment import (
-    SolverOptions,
     adjust,
     residuals_and_q,
     total_cost,
@@ -696,10 +695,10 @@ def test_right_sides_alone_equal_those_of_the_normal_equations(kind, prior):
 @pytest.mark.parametrize('of_exposures', [False, True])
 def test_both_eliminations_agree_with_additional_parameters(of_exposures):
     network, truth = network_with_additional('separate', exposures=4, targets=25)
-    noise, options = Noise('student_t', 0.3, 8.0), SolverOptions(tolerance=1e-12)
-    expected = adjust(network, truth, noise=noise, options=options)
+    noise = Noise('student_t', 0.3, 8.0)
+    expected = adjust(network, truth, noise=noise, tolerance=1e-12)
     with rigs.eliminating(of_exposures):
-        found = adjust(network, truth, noise=noise, options=options)
+        found = adjust(network, truth, noise=noise, tolerance=1e-12)
     assert found.cost == pytest.approx(expected.cost, abs=1e-7)
     for one, other in zip(found.parameters.additional, expected.parameters.additional):
         np.testing.assert_allclose(one, other, atol=1e-4)
@@ -707,9 +706,7 @@ def test_both_eliminations_agree_with_additional_parameters(of_exposures):
 
 def test_gradient_is_zero_at_the_solution_with_additional_parameters():
     network, truth = network_with_additional('separate', exposures=4, targets=25)
-    result = adjust(
-        network, truth, noise=Noise('student_t', 0.3, 8.0), options=SolverOptions(tolerance=1e-12)
-    )
+    result = adjust(network, truth, noise=Noise('student_t', 0.3, 8.0), tolerance=1e-12)
 
     def cost(f, move):
         moved = list(result.parameters.additional)
@@ -949,8 +946,8 @@ def test_coefficients_at_the_solution_of_an_adjustment_that_stopped_before(expos
     network = replace(network, additional=(AdditionalParameters(functions, prior),))
     start = replace(truth, additional=(np.full(count, 0.5),))
     noise = Noise(scale=0.3, nu=4.0)
-    stopped = adjust(network, start, noise=noise, options=SolverOptions(1.0))
-    exact = adjust(network, start, noise=noise, options=SolverOptions(1e-12))
+    stopped = adjust(network, start, noise=noise, tolerance=1.0)
+    exact = adjust(network, start, noise=noise, tolerance=1e-12)
     equations = normal_equations(network, stopped.parameters, 0.0, noise, 0.75)
     solved = solved_additional(factorize(network, equations), network, stopped)[0]
     pulls = [prior @ c for c in (stopped.parameters.additional[0], solved)]

@@ -16,8 +16,8 @@ from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.initial_network import adjusted_with_precision
 from fluoro_calib_ros.estimation.priors import gauge_precision
+from fluoro_calib_ros.photogrammetry import adjustment
 from fluoro_calib_ros.photogrammetry.adjustment import (
-    SolverOptions,
     adjust,
     residuals_and_q,
     total_cost,
@@ -106,7 +106,7 @@ def test_gaussian_adjustment_equals_scipy_least_squares():
         network,
         rigs.disturbed(truth),
         noise=Noise('gaussian'),
-        options=SolverOptions(tolerance=1e-12),
+        tolerance=1e-12,
     )
     assert len(set(network.sigma)) > 1
 
@@ -140,7 +140,7 @@ def test_no_better_solution_is_found_by_direct_minimisation(loss):
     """With the same noise model, scipy cannot improve the solution and finds it from elsewhere."""
     network, truth = rigs.small_network(exposures=3, targets=10, nu=4.0)
     result = adjust_and_estimate_noise(
-        network, rigs.disturbed(truth), noise=Noise(loss), options=SolverOptions(tolerance=1e-12)
+        network, rigs.disturbed(truth), noise=Noise(loss), tolerance=1e-12
     )
     root = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, result)))
     ours = cost_at(network, result)
@@ -493,11 +493,10 @@ def test_an_exposure_without_weight_causes_no_overflow(seed):
     assert np.isfinite(result.cost)
 
 
-def test_running_out_of_steps_is_reported():
+def test_running_out_of_steps_is_reported(monkeypatch):
+    monkeypatch.setattr(adjustment, 'MAX_STEPS', 2)
     network, truth = rigs.small_network(**MANY_TARGETS)
-    result = adjust(
-        network, rigs.disturbed(truth, degrees=3.0, mm=40.0), options=SolverOptions(max_steps=2)
-    )
+    result = adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0))
     assert not result.converged and result.steps == 2
 
 
@@ -523,7 +522,7 @@ def test_given_noise_model_is_not_changed():
         network,
         rigs.disturbed(truth),
         noise=Noise(scale=0.7, nu=9.0),
-        options=SolverOptions(tolerance=1e-12),
+        tolerance=1e-12,
     )
     assert (held.noise.scale, held.noise.nu) == (0.7, 9.0) and held.converged
     directions = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, held))).T

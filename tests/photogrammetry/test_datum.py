@@ -11,7 +11,7 @@ import rigs
 from test_relative import disturbed, rigid_network
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
+from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.network import similarity_directions
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
@@ -66,9 +66,7 @@ def test_solution_and_covariances_equal_a_dense_bordered_system(shape, loss, fre
     network, truth = free_network(free, **shape)
     start = rigs.disturbed(truth)
     start = start if free else replace(start, interior=truth.interior)
-    result = adjust_and_estimate_noise(
-        network, start, noise=Noise(loss), options=SolverOptions(tolerance=1e-12)
-    )
+    result = adjust_and_estimate_noise(network, start, noise=Noise(loss), tolerance=1e-12)
     assert result.converged
     normal, b = dense_free(network, result)
     weight = result.noise.weight(result.q) / (result.noise.scale * network.sigma) ** 2
@@ -112,9 +110,7 @@ def test_residuals_and_interior_orientation_equal_a_minimal_datum(shape):
     """The minimal datum fixes the first exposure and one coordinate of the second source."""
     network, truth = free_network(**shape)
     noise = Noise('gaussian', 0.3)
-    inner = adjust(
-        network, rigs.disturbed(truth), noise=noise, options=SolverOptions(tolerance=1e-12)
-    )
+    inner = adjust(network, rigs.disturbed(truth), noise=noise, tolerance=1e-12)
     dense_b = np.zeros((7, replace(network, datum='survey').n_unknowns))
     m = network.n_exposures
     for row, column in enumerate([0, 1, 2, 3, 4, 5]):  # the first exposure
@@ -217,7 +213,7 @@ def test_prior_of_the_interior_orientation_is_a_pseudo_observation(shape):
         weighted,
         rigs.disturbed(truth),
         noise=Noise('gaussian', 0.3),
-        options=SolverOptions(tolerance=1e-12),
+        tolerance=1e-12,
     )
     normal = rigs.dense_normal_matrix(network, result)
     normal[-3:, -3:] += np.diag(sd[0] ** -2.0)

@@ -20,7 +20,7 @@ from fluoro_calib_ros.estimation.estimator import exposure_folds
 from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.neighbour_regression import CrossValidation
 from fluoro_calib_ros.estimation.options import CalibrationOptions
-from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
+from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
@@ -73,7 +73,7 @@ def test_adjustment_equals_colmap(problem, fixed_points):
     held = fixed_points(network)
     assert held.sum() >= 3 and (held.all() or (~held).sum() > len(held) / 2)
     network = with_datum(network, held)
-    ours = adjust(network, start, None, noise, SolverOptions(tolerance=1e-10))
+    ours = adjust(network, start, 0.0, noise, 1e-10)
     assert ours.converged and ours.noise == noise
     assert np.any(~ours.inliers) or problem is small_problem
 

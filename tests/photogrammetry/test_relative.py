@@ -11,7 +11,6 @@ import rigs
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.photogrammetry.adjustment import (
-    SolverOptions,
     adjust,
     residuals_and_q,
     total_cost,
@@ -225,9 +224,7 @@ def test_both_eliminations_give_the_same_solution_and_covariances(shape, sd):
 @pytest.mark.parametrize('shape', SHAPES)
 def test_gradient_of_the_cost_is_zero_at_the_solution(shape):
     network, truth = rigid_network(**shape)
-    result = adjust_and_estimate_noise(
-        network, disturbed(truth), options=SolverOptions(tolerance=1e-12)
-    )
+    result = adjust_and_estimate_noise(network, disturbed(truth), tolerance=1e-12)
     root = np.linalg.cholesky(np.linalg.inv(dense(network, result)[0]))
     plain = replace(network, relative=())
 

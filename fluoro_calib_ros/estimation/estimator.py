@@ -42,13 +42,13 @@ from ..photogrammetry.rotations import matrix_from_vector
 from .lack_of_fit import LeftOut
 
 if TYPE_CHECKING:
+    from ..correction.angle_field import AngleField
     from ..correction.series import Series
     from ..photogrammetry.adjustment import Adjustment
     from ..photogrammetry.collinearity import AdditionalParameters
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
     from ..photogrammetry.precision import Precision
-    from .exposure_terms import AngleFit
 
 
 class GaugeKind(Enum):
@@ -282,7 +282,7 @@ class TermsOfFluoroscope(ABC):
         """Return what the series omits by design."""
         return ()
 
-    def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleFit | None:
+    def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleField | None:
         """Fit differences between the exposures to the angles of the C-arm.
 
         Afterwards the series and the variance between exposures are those that remain with this

@@ -49,6 +49,7 @@ from .priors import (
 from .ripples import ripples_of
 
 if TYPE_CHECKING:
+    from ..correction.angle_field import AngleField
     from ..photogrammetry.adjustment import Adjustment
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
@@ -275,7 +276,7 @@ class FluoroscopeTerms(TermsOfFluoroscope):
             covariance = covariance + covariance_by_signal(equations, self.prior)
         return self.series(coefficients, covariance)
 
-    def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleFit | None:
+    def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleField | None:
         """See `TermsOfFluoroscope`; None: the terms of exposures do not follow the angles."""
         covariance = precise.additional[self.number]
         if self.own is None or covariance is None or not can_be_fitted(self.angles):
@@ -285,7 +286,7 @@ class FluoroscopeTerms(TermsOfFluoroscope):
             self.functions, self.uv, self.own, coefficients, covariance
         )
         self._angle_fit = fit_angles(estimated, self.angles)
-        return self._angle_fit
+        return None if self._angle_fit is None else self._angle_fit.field
 
     def left_out(self) -> tuple[LeftOut, ...]:
         """Return the signal that the sines omit: of the fields, and of places."""

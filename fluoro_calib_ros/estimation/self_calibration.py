@@ -364,7 +364,7 @@ def calibrate_by_adjustment(
         after = replace(after, parameters=parameters)
         precise = precision(network, after)
         parts = dict(zip(measured.fluoroscopes, terms.parts))
-        fits = {name: part.fit_angles(after, precise) for name, part in parts.items()}
+        fields = {name: part.fit_angles(after, precise) for name, part in parts.items()}
         between = {
             name: part.variance_between_exposures(network, after, precise)
             for name, part in parts.items()
@@ -383,7 +383,7 @@ def calibrate_by_adjustment(
         history=tuple(history.rounds),
         converged=converged,
         between_exposures=between,
-        angle_fields={name: fit.field for name, fit in fits.items() if fit is not None},
+        angle_fields={name: field for name, field in fields.items() if field is not None},
     )
 
 

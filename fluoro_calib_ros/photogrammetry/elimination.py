@@ -6,7 +6,7 @@
 Schur complement: Triggs, McLauchlan, Hartley and Fitzgibbon, "Bundle Adjustment - A Modern
 Synthesis", 2000, section 6. Eliminating the object points leaves a system of exposures, and
 eliminating the exposures leaves one of object points; each is bordered by the global unknowns.
-Exposures that are coupled by a relative orientation are eliminated together. The interface
+Exposures that are coupled by a relative orientation are eliminated together. The class
 `Elimination` hides everything that depends on this choice.
 """
 

@@ -98,7 +98,7 @@ def test_prior_of_an_exterior_orientation_is_weighted_as_it_should_be():
     """An orientation is observed twice: information of the prior and of the images add up."""
     network, truth = rigs.small_network(exposures=3, targets=30, nu=np.inf)
     noise = Noise('gaussian', 0.3)
-    free = adjust(network, truth, None, noise)
+    free = adjust(network, truth, 0.0, noise)
     without = precision(network, free)
     sd = np.full((3, 6), np.inf)
     sd[0] = np.sqrt(np.diagonal(without.exterior[0]))
@@ -106,7 +106,7 @@ def test_prior_of_an_exterior_orientation_is_weighted_as_it_should_be():
     shifted[0] += [0.3, 0, 0]
     prior = ExteriorPrior(truth.rotation, shifted, sd)
     weighted = replace(network, exterior=prior)
-    found = adjust(weighted, truth, None, noise)
+    found = adjust(weighted, truth, 0.0, noise)
     wanted = np.linalg.inv(np.linalg.inv(without.exterior[0]) + np.diag(prior.weights[0]))
     size = np.sqrt(np.outer(np.diagonal(wanted), np.diagonal(wanted)))
     np.testing.assert_allclose(

@@ -25,7 +25,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .rotations import cross_matrix, left_jacobian, matrix_from_vector, vector_from_matrix
+from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
 
 # Source or translation [mm], and rotation vector [rad]: of an exposure, of a relative orientation,
 # or of a body in the rig frame.
@@ -204,6 +204,20 @@ class Parameters:
         return coefficients
 
 
+def inverse_left_jacobian(w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return derivatives (..., 3, 3) of log(exp(v) exp(w)) with respect to v at v = 0.
+
+    w (..., 3): rotation vectors [rad] (Barfoot 7.1.3).
+    """
+    half = np.linalg.norm(w, axis=-1)[..., None, None] / 2
+    k = cross_matrix(w)
+    # (1 - h cot h) / (4 h^2) is 0/0 at zero, where its limit is 1/12.
+    is_small = half < 1e-3
+    safe = np.where(is_small, 1.0, half)
+    factor = np.where(is_small, 1 / 12 + half**2 / 180, (1 - safe / np.tan(safe)) / (4 * safe**2))
+    return np.eye(3) - k / 2 + factor * (k @ k)
+
+
 def relative_poses(
     parameters: Parameters, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -251,7 +265,7 @@ def discrepancies_with_jacobian(
     turn, shift = relative_poses(parameters, constraint.pairs)
     scale, d_scale = _translation_scale(constraint, pose)
     w = vector_from_matrix(turn @ pose.rotation.T)
-    inverse_jacobian = np.linalg.inv(left_jacobian(w))
+    inverse_jacobian = inverse_left_jacobian(w)
     d_a = np.zeros((len(a), POSE_SIZE, POSE_SIZE))
     d_b = np.zeros_like(d_a)
     d_pose = np.zeros_like(d_a)
@@ -261,7 +275,7 @@ def discrepancies_with_jacobian(
     d_a[:, 3:, 3:] = -inverse_jacobian @ turn
     d_b[:, 3:, 3:] = inverse_jacobian
     d_pose[:, :3, :3] = -scale * np.eye(3) + (shift - pose.translation_mm)[:, :, None] * d_scale
-    d_pose[:, 3:, 3:] = -np.linalg.inv(left_jacobian(-w))
+    d_pose[:, 3:, 3:] = -inverse_left_jacobian(-w)
     return np.concatenate([scale * (shift - pose.translation_mm), w], axis=1), d_a, d_b, d_pose
 
 

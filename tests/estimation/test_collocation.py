@@ -798,7 +798,7 @@ def test_ripples_of_one_wavelength_are_corrected():
         run.measured.network, run.measured.image_size, run.before, (GaugeKind.FULL,)
     )
     parts = CollocationTerms(problem, earlier=EarlierTerms([model.series], [None], False))
-    assert parts.functions == state.functions
+    assert parts.parts[0].functions == state.parts[0].functions
     assert parts.priors[0].signal.ripples.bands == state.priors[0].signal.ripples.bands
 
 

@@ -85,10 +85,11 @@ class Profile:
         part's change on the derivative of the shadow.
         """
         tables = _tables_of_blurs(self)
-        by_distance = sum(tables)[1]
+        by_distance = np.sum(tables, axis=0)[1]
         variance = self.blurs[0][1] ** 2
         change = sum(
-            (sigma**2 - variance) * table[1] for (_, sigma), table in zip(self.blurs, tables)
+            ((sigma**2 - variance) * table[1] for (_, sigma), table in zip(self.blurs, tables)),
+            start=np.zeros_like(by_distance),
         )
         weight = np.arange(len(by_distance)) * by_distance
         return variance, float(weight @ change / (weight @ by_distance))
@@ -142,7 +143,7 @@ class Shadows:
     """Tables of the shadows of beads of one or several profiles."""
 
     def __init__(self, profiles: Sequence[Profile]) -> None:
-        tables = [np.asarray(sum(_tables_of_blurs(one))) for one in profiles]
+        tables = [np.sum(_tables_of_blurs(one), axis=0) for one in profiles]
         ends = np.cumsum([table.shape[1] for table in tables])
         self._first = np.concatenate([[0], ends[:-1]])
         self._last = ends - 2

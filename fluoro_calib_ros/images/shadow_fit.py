@@ -362,32 +362,6 @@ class ShadowFit(ABC):
             self.influence = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
         return inverse
 
-    def _textured_slope(self) -> NDArray[np.float64]:
-        """Return relative slopes (n, 2) of the backgrounds beyond the polynomials [1/px].
-
-        They are those of the planes that fit them best where the place of a shadow is determined.
-        """
-        slope = np.zeros_like(self.uv)
-        distance = np.linalg.norm(self.offset, axis=1)
-        border = self.profile.shadow(distance)[1] ** 2
-        plane = border[:, None] * self.offset / (0.5 * border @ distance**2)
-        for group in self.groups:
-            textured = self.texture.strength[group[0]] > 0
-            rows, near = group[0][textured], group[1][textured]
-            light, _ = self._model(rows, near)
-            grey = self.grey[rows]
-            weight = self._valid(rows, grey, light) / self.noise.variance(light)
-            relative = self.background.relative(rows, light)
-            for cosines, own in self.texture.in_windows(rows):
-                expected = cosines.expected(
-                    self.texture.strength[rows[own]],
-                    relative[own],
-                    weight=weight[own],
-                    residual=(grey - light)[own],
-                )
-                slope[rows[own]] += expected @ plane / self.background.light[rows[own], None]
-        return slope
-
     def _images(self, windows: np.ndarray) -> NDArray[np.float64]:
         """Return square images (g, w, w) of round windows (g, m)."""
         half = int(np.abs(self.offset).max())
@@ -426,7 +400,7 @@ class ShadowFit(ABC):
         drawn = blurred * slope
         shift = DRAWN * drawn
         if masked:  # it amplifies edges, so that the background beyond the polynomial counts, too
-            shift += masked * (slope + self._textured_slope())
+            shift += masked * (slope + _textured_slope(self))
         return Beads(
             self.uv + shift,
             np.hypot(sigma, DRAWN_SD * np.sqrt(0.5 * (drawn * drawn).sum(axis=1))),
@@ -436,6 +410,33 @@ class ShadowFit(ABC):
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,
         )
+
+
+def _textured_slope(fit: ShadowFit) -> NDArray[np.float64]:
+    """Return relative slopes (n, 2) of the backgrounds beyond the polynomials [1/px].
+
+    They are those of the planes that fit them best where the place of a shadow is determined.
+    """
+    slope = np.zeros_like(fit.uv)
+    distance = np.linalg.norm(fit.offset, axis=1)
+    border = fit.profile.shadow(distance)[1] ** 2
+    plane = border[:, None] * fit.offset / (0.5 * border @ distance**2)
+    for group in fit.groups:
+        textured = fit.texture.strength[group[0]] > 0
+        rows, near = group[0][textured], group[1][textured]
+        light, _ = fit._model(rows, near)
+        grey = fit.grey[rows]
+        weight = fit._valid(rows, grey, light) / fit.noise.variance(light)
+        relative = fit.background.relative(rows, light)
+        for cosines, own in fit.texture.in_windows(rows):
+            expected = cosines.expected(
+                fit.texture.strength[rows[own]],
+                relative[own],
+                weight=weight[own],
+                residual=(grey - light)[own],
+            )
+            slope[rows[own]] += expected @ plane / fit.background.light[rows[own], None]
+    return slope
 
 
 def _within(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:

@@ -393,23 +393,32 @@ class ShadowFit(ABC):
         # Where shadows touch, the model errs by more than the noise of the pixels suggests.
         factor[self.distance < 2 * self.profile.radius_px] *= self.settings.crossed
         sigma = np.sqrt(self.sigma**2 + by_correlation) * factor
-        # The noise of holes in a sheet does not increase with the inverted light: they are not
-        # shadows that attenuate it.
-        blurred, masked = self.profile.drawn_px2 if self.noise.gain else (0.0, 0.0)
-        slope = self.background.slope(self.uv - self.middle)
-        drawn = blurred * slope
-        shift = DRAWN * drawn
-        if masked:  # it amplifies edges, so that the background beyond the polynomial counts, too
-            shift += masked * (slope + _textured_slope(self))
+        shift, sd = _shifts(self)
         return Beads(
             self.uv + shift,
-            np.hypot(sigma, DRAWN_SD * np.sqrt(0.5 * (drawn * drawn).sum(axis=1))),
+            np.hypot(sigma, sd),
             depth=self.depth.copy(),
             light=self.background.light,
             misfit=self.misfit / max(typical, 1e-12),
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,
         )
+
+
+def _shifts(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return shifts (n, 2) back from less light, where blur and mask have drawn shadows [px].
+
+    The second value is the standard deviation of a coordinate (n,).
+    """
+    # The noise of holes in a sheet does not increase with the inverted light: they are not shadows
+    # that attenuate it.
+    blurred, masked = fit.profile.drawn_px2 if fit.noise.gain else (0.0, 0.0)
+    slope = fit.background.slope(fit.uv - fit.middle)
+    drawn = blurred * slope
+    shift = DRAWN * drawn
+    if masked:  # it amplifies edges, so that the background beyond the polynomial counts, too
+        shift += masked * (slope + _textured_slope(fit))
+    return shift, DRAWN_SD * np.sqrt(0.5 * (drawn * drawn).sum(axis=1))
 
 
 def _textured_slope(fit: ShadowFit) -> NDArray[np.float64]:

@@ -81,7 +81,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_file_options(parser)
     parser.add_argument(
-        '--out-units', choices=UNITS, help='unit of what is written (default: --units, else mm)'
+        '--out-units',
+        choices=UNITS,
+        help='unit of what is written (default: mm in files that state their unit, else --units)',
     )
 
 

@@ -42,7 +42,11 @@ class PointStatus(IntEnum):
 
 
 # Plain integers: numpy compares arrays with them faster than with members of the enumeration.
-OK, OUTSIDE, REJECTED, FAILED, SINGLE_VIEW = map(int, PointStatus)
+OK = int(PointStatus.OK)
+OUTSIDE = int(PointStatus.OUTSIDE)
+REJECTED = int(PointStatus.REJECTED)
+FAILED = int(PointStatus.FAILED)
+SINGLE_VIEW = int(PointStatus.SINGLE_VIEW)
 STATUS_NAMES = tuple(status.name for status in PointStatus)
 MAX_STEPS = 10
 # Square of a step, in standard deviations, below which the iteration ends. A step reduces the

@@ -258,6 +258,14 @@ ROWS: dict[str, Row] = {
     'cube-36 bone': Row(cube(36), bone=True),
     'cube-36 unsharp plates': Row(cube(36), unsharp=1.5, plates=5),
     'cube-36 unsharp bone': Row(cube(36), unsharp=1.5, bone=True),
+    'cube-36 unsharp 3': Row(cube(36), unsharp=3.0),
+    'cube-36 clipped plates': Row(cube(36), gain=420.0, plates=5),
+    'cube-36 clipped bone': Row(cube(36), gain=420.0, bone=True),
+    'cube-36 clipped JPEG 15': Row(cube(36), gain=420.0, jpeg=15),
+    'cube-36 clipped unsharp': Row(cube(36), gain=420.0, unsharp=1.5),
+    'frame-503 clipped plates': Row(
+        frame(503), photons=4000.0, faces=70.0, tilt_deg=12.0, gain=420.0
+    ),
     'cube-48 three sizes': Row(three_sizes(48), told=True),
     'cube-48 three sizes untold': Row(three_sizes(48)),
     'grid of beads': Row(sheet(20, 5.0, False, 2), tilt_deg=15.0),
@@ -281,6 +289,9 @@ ROWS: dict[str, Row] = {
         for hexagonal in (False, True)
         for marks in (1, 3)
     },
+    'hexagonal sheet 20 clipped': Row(
+        sheet(20, 6.0, True, 1), holes=True, gain=420.0, tilt_deg=15.0
+    ),
     'nothing': Row(nothing, wanted=cube(36)),
     'nothing at 3 % dose': Row(nothing, photons=45.0, wanted=cube(36)),
     'empty and clipped': Row(nothing, gain=420.0, wanted=cube(36)),

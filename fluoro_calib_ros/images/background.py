@@ -5,6 +5,10 @@
 
 Plates and bones attenuate direct light exponentially, so its logarithm is a polynomial. Scattered
 light comes from wide surroundings and is constant in a window.
+
+Where nearly all of the light around a bead is clipped, only the inside of its shadow is left, in
+which a slope of the light looks much like a shift of the shadow. Slopes and curvatures then have a
+prior, which is estimated from all windows of the image.
 """
 
 from __future__ import annotations
@@ -21,7 +25,13 @@ PLANE_TERMS = 3  # those of degree 1
 MIN_DIRECT = 0.1  # least share of direct light in the light around a bead
 DARK = 1e-3  # grey value below which light cannot be distinguished from none
 LARGE = 0.1  # relative change of direct light that differs from that of its logarithm
+HELD = 1e12  # prior weight that keeps a term at zero
 MAX_FACTOR = 20.0  # largest factor on the direct light in a step
+EM_STEPS = 50  # iterations after which widths of priors have converged to 5 %
+SLOPES = slice(0, 2)  # of the terms but the constant one
+CURVATURES = slice(2, TERMS - 1)
+START_SPREAD = 0.3  # initial standard deviation of the terms; EM reaches smaller ones from it
+MIN_SPREAD = 1e-3  # least one
 
 
 class Background:
@@ -36,6 +46,8 @@ class Background:
         self.around: NDArray[np.floating] = np.zeros(count)
         self.scatter = 0.0  # share of scattered light, relative to that of the surroundings
         self.plane_only = False  # whether the polynomial is of degree 1
+        # Prior standard deviations of the terms but the constant one.
+        self.spread = np.full(TERMS - 1, np.inf)
 
     def start(
         self, light: NDArray[np.floating], around: NDArray[np.floating] | None, scatter: float
@@ -73,6 +85,22 @@ class Background:
         middle of the window.
         """
         return np.asarray(passed * np.exp(-self.terms[rows, :1]).astype(DTYPE))
+
+    def unit(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the unit (g, 1) of steps of the terms."""
+        return np.asarray(np.exp(self.terms[rows, :1]))
+
+    def in_steps(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the terms (g, TERMS - 1) but the constant one in the unit of their steps."""
+        return self.terms[rows, 1:] * self.unit(rows)
+
+    def prior(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the prior weights (g, TERMS) of steps of the terms; their mean is zero."""
+        prior = np.zeros((len(rows), TERMS))
+        prior[:, 1:] = (self.spread * self.unit(rows)) ** -2
+        if self.plane_only:
+            prior[:, PLANE_TERMS:] = HELD
+        return prior
 
     def relative(
         self, rows: NDArray[np.int64], light: NDArray[np.floating]
@@ -119,3 +147,58 @@ class Background:
         _, by_x, by_y, by_xx, by_xy, by_yy = self.terms.T
         gradient = by_x + 2 * by_xx * x + by_xy * y, by_y + by_xy * x + 2 * by_yy * y
         return np.column_stack(gradient) / self.window_px
+
+
+class HiddenLight:
+    """Spread of the terms of backgrounds (n, TERMS), but for the constant one, in an image.
+
+    It is estimated from the normal equations of all windows by expectation-maximisation (Dempster,
+    Laird and Rubin, J. R. Stat. Soc. B 39, 1977).
+    """
+
+    def __init__(self, count: int) -> None:
+        self._normal = np.zeros((count, TERMS - 1, TERMS - 1))
+        self._right = np.zeros((count, TERMS - 1))
+
+    def note(
+        self,
+        rows: NDArray[np.int64],
+        normal: NDArray[np.float64],
+        right: NDArray[np.float64],
+        background: Background,
+    ) -> None:
+        """Note what normal equations (g, u, u), (g, u) of windows tell about their terms."""
+        terms = np.arange(1, TERMS)
+        others = np.delete(np.arange(normal.shape[1]), terms)
+        cross = normal[:, others[:, None], terms]
+        columns = np.concatenate([cross, right[:, others, None]], axis=2)
+        eliminated = np.linalg.solve(normal[:, others[:, None], others], columns)
+        eliminated = np.swapaxes(cross, 1, 2) @ eliminated
+        prior = background.prior(rows)[:, 1:]
+        own = normal[:, terms[:, None], terms] - eliminated[:, :, :-1]
+        own[:, terms - 1, terms - 1] -= prior
+        unit = background.unit(rows)
+        step = right[:, terms] - eliminated[:, :, -1] + prior * background.in_steps(rows)
+        self._normal[rows] = own * unit[:, None] ** 2
+        self._right[rows] = (step * unit) + (
+            self._normal[rows] @ background.terms[rows, 1:, None]
+        )[..., 0]
+
+    def spread(self, usable: NDArray[np.bool_], lack: float) -> NDArray[np.float64]:
+        """Return standard deviations (TERMS - 1,) of the terms of usable windows (n,).
+
+        lack: typical lack of fit, the factor on the variance of the noise.
+        """
+        noted = usable & (np.trace(self._normal, axis1=1, axis2=2) > 0)
+        normal = self._normal[noted] / lack
+        right = self._right[noted] / lack
+        variance = np.full(TERMS - 1, START_SPREAD**2)
+        diagonal = np.eye(TERMS - 1)
+        for _ in range(EM_STEPS if noted.any() else 0):
+            covariance = np.linalg.inv(normal + diagonal / variance)
+            mean = (covariance @ right[..., None])[..., 0]
+            square = mean**2 + np.diagonal(covariance, axis1=1, axis2=2)
+            for alike in (SLOPES, CURVATURES):
+                variance[alike] = max(float(square[:, alike].mean()), MIN_SPREAD**2)
+        # The normal equations of windows have the noise without that factor.
+        return np.sqrt(variance / lack)

@@ -23,12 +23,12 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
+from .clipping import Clipping
 from .discs import set_apart
 from .light import (
     COARSE_BLUR,
     Light,
     Noise,
-    clipped_at,
     estimate_noise,
     vertex,
     white_level,
@@ -150,7 +150,7 @@ class _Sight:
         _check(image)
         grey = np.minimum(image, image.dtype.type(white_level(image))).astype(np.float32)
         if noise is None:
-            noise = estimate_noise(grey, (image > image.min()) & (image < image.max()))
+            noise = estimate_noise(grey, Clipping.of(grey).leaves(grey))
         typical = int(np.clip(SEEN_SHARE * beads, LEAST_TYPICAL, MOST_TYPICAL))
         return cls(grey, noise, typical)
 
@@ -242,11 +242,14 @@ class _Sight:
         """
         grey = self.grey
         light = float(grey.max()) - grey if inverted else grey
-        low, high = clipped_at(light)
+        clipping = Clipping.of(light)
         field = field_of_view(light, scale)
         if inverted:
             # Holes of a sheet are bright, but there is no light outside the field either.
             field &= field_of_view(grey, scale)
+        noise = self.noise
+        if inverted:
+            noise = estimate_noise(light, field & clipping.leaves(light))
         for wider in WIDER:
             blobs = _beads(self.blobs(wider * scale, inverted), field, self.typical)
             uv = blobs.uv
@@ -257,8 +260,8 @@ class _Sight:
                     uv, radius = set_apart(light / _light_around(light, scale), uv)
             if len(uv):
                 return Detections(
-                    Light(light, field, low, high),
-                    estimate_noise(light, field) if inverted else self.noise,
+                    Light(light, field, clipping),
+                    noise,
                     uv=uv,
                     scale=scale,
                     radius_px=radius or scale * BLOB_RADIUS,

@@ -40,10 +40,6 @@ START_MASK_PX = 3.0
 # four images with a mask of factor 1.5 and 3 px, and at most .15 in 41 images without one but in
 # one, whose profile was not the best.
 COMMON = 0.15
-# Share of clipped pixels in windows of isolated shadows from which no mask is searched for. It was
-# at most 0.0004 in three images where bright borders of a mask were clipped, and 0.56 to 0.64 in
-# six images with a clipped background.
-CLIPPED = 0.01
 MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image
 # Largest lack of fit with a mask over that without one. It was .43 to .88 in seven images with a
 # mask whose parameters were found, and .98 in one where they were not.
@@ -228,8 +224,7 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         return imaging
     shapes = shadows.shape[rows], size[rows]
     fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)
-    clipped = np.mean(fit.grey[fit.valid] >= light.high)
-    if clipped > CLIPPED or np.median(fit.common_share()) < COMMON:
+    if np.median(fit.common_share()) < COMMON:
         return imaging
     isolated = replace(shadows, alone=alone)
     profile = start

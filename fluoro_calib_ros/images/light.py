@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from .clipping import UNCLIPPED, Clipping
+
 MIN_VARIANCE = 1 / 12  # variance of rounding to integers
 SAMPLED = 100_000  # pixels for the noise estimate: they give the median of each level to 2 %
 LEVELS = 30  # levels of light at which the noise is estimated
@@ -30,7 +32,6 @@ SURE_CORRELATION = 3.0  # significance limit of a correlation [standard deviatio
 LAGS = 4  # largest lag at which noise is correlated [px]
 SECOND = np.array([1.0, -2.0, 1.0])  # kernel of second differences
 MIN_SEEN = 0.1  # least share of the variance in second differences: noise blurred by a pixel
-MIN_CLIPPED = 10  # largest number of outermost grey values that is no evidence of clipping
 WHITE_LEVELS = (255, 4095)  # largest grey values of 8 and 12 bits
 HOT_SHARE = 1e-5  # share of hot pixels: ten in an image of 1024 x 1024 px
 MIN_PIXELS = 1000  # pixels that estimates of noise and correlation need
@@ -51,9 +52,7 @@ class Light:
 
     grey: NDArray[np.float32]  #: (h, w)
     field: NDArray[np.bool_]  #: (h, w), the field of view
-    #: grey values at which the image is clipped: less, or more, light does not change them
-    low: float = -np.inf
-    high: float = np.inf
+    clipping: Clipping = UNCLIPPED
 
     def around(self, uv: NDArray[np.float64]) -> NDArray[np.floating]:
         """Return the mean light (n,) in the surroundings of pixels (n, 2)."""
@@ -91,24 +90,6 @@ def white_level(image: np.ndarray) -> int:
         if above <= HOT_SHARE * image.size or above == np.count_nonzero(image == full):
             return min(white, full)
     return full
-
-
-def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:
-    """Return the values at which an image (h, w) is clipped, infinite if it is not.
-
-    With noise alone, the outermost value is rarer than its neighbour.
-    """
-    lowest = float(grey.min())
-    highest = float(grey.max())
-    low = lowest if _is_clipped(grey, lowest, lowest + 1) else -np.inf
-    high = highest if _is_clipped(grey, highest, highest - 1) else np.inf
-    return low, high
-
-
-def _is_clipped(grey: NDArray[np.floating], outermost: float, neighbour: float) -> bool:
-    """Return whether an outermost grey value is more frequent than its neighbour."""
-    count = int(np.count_nonzero(grey == outermost))
-    return count > max(int(np.count_nonzero(grey == neighbour)), MIN_CLIPPED)
 
 
 @dataclass(frozen=True)

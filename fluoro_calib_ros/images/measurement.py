@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from .background import PLANE_TERMS, TERMS
+from .background import TERMS, HiddenLight
 from .fine_grid import Absorbers, FineGrid
 from .light import Light, Noise, less_common
 from .profile import Absorbed, Profile, Shadows
@@ -43,6 +43,8 @@ SETTINGS = FitSettings(
 )
 STEPS = SETTINGS.steps
 FIRST_STEPS = 3  # steps that only have to separate beads from other objects
+HIDDEN = 0.5  # share of clipped pixels beyond which they hide the light of a window
+HIDDEN_STEP = 2  # step from which light that clipped pixels hide has a prior
 # Largest step of a coordinate of a bead that has converged: the next step is about ten times
 # shorter, and the centres of the sharpest beads are known to 0.01 px.
 SETTLED_PX = 0.003
@@ -56,7 +58,6 @@ RADIUS_SD = 0.01
 # small.
 CLIPPED_RADIUS_SD = 0.17
 SEEN_LIGHT = 0.05  # share of unclipped light below which the light counts as clipped
-HELD = 1e12  # prior weight that keeps a term at zero
 
 
 def rounded(size: NDArray[np.float64], step: float) -> NDArray[np.float64]:
@@ -117,6 +118,7 @@ class BeadFit(ShadowFit):
             SETTINGS, profile, noise=noise, uv=uv, depth=np.ones(len(uv)), window_px=window
         )
         self.radius = self.stretch * self.size
+        self.hidden: HiddenLight | None = None
         self.disturbed = np.zeros(len(uv), dtype=bool)
         self.settled = np.zeros(len(uv), dtype=bool)
         self.moved = np.zeros(len(uv))  # RMS shift of u and v by relative errors 1 of radii [px]
@@ -148,11 +150,13 @@ class BeadFit(ShadowFit):
         pixel = np.where(inside, row * width + column, 0)
         valid = inside & light.field.take(pixel)
         grey = light.grey.take(pixel)
-        self.low = light.low
-        self.high = light.high
+        self.clipping = light.clipping
         bright = np.where(valid, grey, 0.0)
         self._set_windows(grey, valid & own, bright=bright, around=light.around(self.uv))
         self.usable = self.valid.sum(axis=1) >= MIN_INSIDE * own.sum(axis=1)
+        clipped = self.valid & ~self.clipping.leaves(grey)
+        if (clipped.sum(axis=1) > HIDDEN * self.valid.sum(axis=1)).any():
+            self.hidden = HiddenLight(len(self.uv))
         # If part of the border is missing, a shadow that is not quite that of a sphere moves.
         from_edge = np.minimum(self.uv, (width - 1, height - 1) - self.uv).min(axis=1)
         self.usable &= from_edge >= self.profile.radius_px * self.radius
@@ -168,6 +172,9 @@ class BeadFit(ShadowFit):
             final = step == steps - 1
             if step in self.settings.crossing_steps:
                 active |= self._cross()
+            if self.hidden and step >= HIDDEN_STEP and not self.background.plane_only:
+                self.background.spread = self.hidden.spread(self.usable, self.typical())
+                active[:] = True
             groups = []
             for rows, near in self.groups:
                 chosen = active[rows] | (final and near.shape[1] > 0)
@@ -259,12 +266,6 @@ class BeadFit(ShadowFit):
     def _depth_sd(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> float:
         return DEPTH_SD
 
-    def _prior(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.float64]:
-        prior = super()._prior(rows, near)
-        if self.background.plane_only:
-            prior[:, PLANE_TERMS:TERMS] = HELD
-        return prior
-
     def _solve(
         self,
         rows: NDArray[np.int64],
@@ -273,6 +274,8 @@ class BeadFit(ShadowFit):
         final: bool,
     ) -> np.ndarray:
         step = np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
+        if self.hidden and not self.background.plane_only:
+            self.hidden.note(rows, equations.matrix, equations.right, self.background)
         # The step reduces the squared residuals by its product with the right side.
         self.settled[rows] = (np.abs(step[:, TERMS : TERMS + 2]) <= SETTLED_PX).all(axis=1)
         self.settled[rows] &= (step * equations.right).sum(axis=1) <= self.misfit[rows]
@@ -317,7 +320,7 @@ class BeadFit(ShadowFit):
         plane = self.background.direct(every) + self.background.scattered(every)
         x, y = np.moveaxis(self.middle[:, None] + self.offset - self.uv[:, None], 2, 0)
         distance = np.sqrt(self._squared(every, x, y))
-        known = self.valid & (self.grey > self.low) & (self.grey < self.high)
+        known = self.valid & self.clipping.leaves(self.grey)
         light = np.empty_like(self.grey)
         for rows, near in self.groups:
             light[rows] = self._model(rows, near)[0]
@@ -359,12 +362,12 @@ class BeadFit(ShadowFit):
 
     def _is_light_clipped(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return (g,) whether nearly all pixels outside the shadows of windows are clipped."""
-        if not (len(rows) and np.isfinite(self.high)):
+        if not (len(rows) and np.isfinite(self.clipping.high)):
             return np.zeros(len(rows), dtype=bool)
         reach = self.profile.reach_px * self.radius.max()
         away, _ = cKDTree(self.uv).query(self.middle[rows, None] + self.offset)
         light = self.valid[rows] & (away > reach)
-        seen = light & (self.grey[rows] < self.high)
+        seen = light & (self.grey[rows] < self.clipping.high)
         return np.asarray(seen.sum(axis=1) < SEEN_LIGHT * light.sum(axis=1))
 
 
@@ -414,14 +417,13 @@ def scatter_equation(fit: BeadFit, count: int) -> tuple[float, float]:
         rows, near = rows[chosen], near[chosen]
         light, jacobian = fit._model(rows, near)
         by_scatter = _by_scatter(fit, rows, near, light, jacobian)
-        weight = fit._valid(rows, fit.grey[rows], light) / fit.noise.variance(light)
+        residual, weight, _ = fit._observed(rows, light)
         both = np.concatenate([jacobian, by_scatter[:, None].astype(DTYPE)], axis=1)
         weighted = both * weight[:, None]
         normal = (weighted @ np.swapaxes(both, 1, 2)).astype(float)
         diagonal = np.arange(jacobian.shape[1])
         normal[:, diagonal, diagonal] += fit._prior(rows, near) + 1e-12
-        residual = (fit.grey[rows] - light)[..., None]
-        columns = np.concatenate([weighted @ residual, normal[:, :, -1:]], axis=2)
+        columns = np.concatenate([weighted @ residual[..., None], normal[:, :, -1:]], axis=2)
         eliminated = np.linalg.solve(normal[:, :-1, :-1], columns[:, :-1])
         equation += (columns[:, -1:] - normal[:, -1:, :-1] @ eliminated).sum(axis=(0, 1))
     # Both windows of a pair contain the overlap.

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .background import TERMS, Background
+from .clipping import UNCLIPPED
 from .light import MIN_PIXELS, Noise, correlation_of, less_common
 from .profile import Profile
 from .texture import DTYPE, Texture, window_offsets
@@ -45,6 +46,9 @@ AT_ONCE = 2**18  # derivatives computed together, 1 MB: they fit into a cache
 CORRELATED = 180  # windows from which the correlation of the noise is estimated
 INFLUENCES = 20  # beads for which the influence of their pixels is computed
 UNDISTURBED = 4.0  # largest lack of fit, over the median, of a window without other objects
+# Information of a pixel, over that of one that is not clipped, from which its residual counts in
+# statistics of residuals.
+KNOWN = 0.5
 ROBUST = 2.5  # residual at which the weight is halved [standard deviations of the noise]
 
 # Rows of beads (g,) and of their neighbours (g, k), -1 for none.
@@ -141,8 +145,7 @@ class ShadowFit(ABC):
         self.influence: np.ndarray | None = None  # of the pixels (k, m) of some windows on centres
         self.misfit = np.full(n, np.inf)
         self.distance = np.full(n, np.inf)  # distance of the nearest bead
-        self.low = -np.inf  # grey values at which the image is clipped
-        self.high = np.inf
+        self.clipping = UNCLIPPED
         self.crossing: np.ndarray | None = None
         self.texture = Texture.none(n, self.offset, (profile.sharpening, profile.mask_px))
         self.groups: list[Group] = []
@@ -239,10 +242,7 @@ class ShadowFit(ABC):
         """Return normal equations of beads and note their lack of fit; usual: the typical one."""
         rows, near = group
         light, jacobian = self._model(rows, near)
-        grey = self.grey[rows]
-        residual = grey - light
-        valid = self._valid(rows, grey, light)
-        weight = valid / self.noise.variance(light)
+        residual, weight, information = self._observed(rows, light)
         squared = residual * residual * weight
         total = squared.sum(axis=1)
         disturbed = self._disturbed(rows, near, final) & (self.texture.strength[rows] == 0)
@@ -255,6 +255,7 @@ class ShadowFit(ABC):
         diagonal = np.arange(normal.shape[1])
         normal[:, diagonal, diagonal] += prior + 1e-9 * normal[:, diagonal, diagonal] + 1e-12
         right = (weighted @ residual.astype(DTYPE)[..., None])[..., 0].astype(float)
+        right[:, 1:TERMS] -= prior[:, 1:TERMS] * self.background.in_steps(rows)
         expected = self.expected_depth[rows]
         right[:, TERMS + 2] -= prior[:, TERMS + 2] * (self.depth[rows] - expected)
         plain = normal.copy() if self.texture.strength[rows].any() else normal
@@ -269,18 +270,18 @@ class ShadowFit(ABC):
             normal[textured] -= taken[0]
             right[textured] -= taken[1]
             total[textured] -= taken[2]
-        self.misfit[rows] = total / np.maximum(valid.sum(axis=1) - OWN, 1)
-        standardised = np.sqrt(squared) * np.sign(residual)
+        self.misfit[rows] = total / np.maximum(information.sum(axis=1) - OWN, 1)
+        valid = information > KNOWN
+        standardised = np.sqrt(squared) * np.sign(residual) * valid
         return NormalEquations(
             normal, plain, right, weighted=weighted, residual=standardised, valid=valid
         )
 
     def _add_texture(self) -> None:
         """Add a background beyond the polynomial to beads whose pixels show one."""
-        (rows, relative, residual, root), jacobians = self._standardised()
+        (rows, relative, residual, root, valid), jacobians = self._standardised()
         plain = np.flatnonzero(self.misfit[rows] <= self.typical())
         plain = plain[:: len(plain) // CORRELATED + 1]
-        valid = root > 0
         usual = self.misfit[rows] <= DISTURBED * self.typical()
         residual = less_common(self.uv[rows], self.radius[rows], residual, valid, usual)
         self.correlation = self._correlation(residual[plain], valid[plain])
@@ -296,16 +297,16 @@ class ShadowFit(ABC):
         """Return standardised residuals of all windows, and the derivatives of each part of them.
 
         The first are the beads (n,), light as a fraction of that without beads (n, m), residuals
-        (n, m), and roots of weights (n, m), 0 for invalid pixels.
+        (n, m), roots of weights (n, m), 0 for invalid pixels, and whether pixels are known (n, m).
         """
         groups = [part for group in self.groups for part in _parts(*group, len(self.offset))]
         lights, jacobians = zip(*(self._model(*part) for part in groups))
         light = np.concatenate(lights)
         rows = np.concatenate([rows for rows, _ in groups])
-        grey = self.grey[rows]
-        root = self._valid(rows, grey, light) / np.sqrt(self.noise.variance(light), dtype=DTYPE)
+        residual, weight, information = self._observed(rows, light)
+        root = np.sqrt(weight, dtype=DTYPE)
         relative = self.background.relative(rows, light)
-        return (rows, relative, (grey - light) * root, root), list(jacobians)
+        return (rows, relative, residual * root, root, information > KNOWN), list(jacobians)
 
     def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
         """Return the correlation of the noise from standardised residuals (g, m) of windows.
@@ -318,21 +319,26 @@ class ShadowFit(ABC):
         of_windows = correlation_of(self._images(residual), self._images(valid))
         return min(of_windows, self.noise.correlation, key=np.sum)
 
-    def _valid(self, rows: np.ndarray, grey: np.ndarray, light: np.ndarray) -> NDArray[np.bool_]:
-        """Return the valid pixels (g, m): a clipped pixel that agrees with the model is not valid.
+    def _observed(
+        self, rows: NDArray[np.int64], light: NDArray[np.floating]
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+        """Return residuals (g, m), their weights (g, m), and the information (g, m) of pixels.
 
-        grey, light: (g, m) observed and expected values.
+        light: (g, m) expected values. The information is 1, less if a pixel is clipped, 0 if it is
+        invalid.
         """
+        variance = self.noise.variance(light)
         valid = self.valid[rows]
-        if np.isfinite(self.high):
-            valid &= (grey < self.high) | (light <= grey)
-        if np.isfinite(self.low):
-            valid &= (grey > self.low) | (light >= grey)
-        return valid
+        if not self.clipping:
+            return self.grey[rows] - light, valid / variance, valid
+        residual, information = self.clipping.observed(self.grey[rows], light, variance)
+        information *= valid
+        return residual, information / variance, information
 
     def _prior(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the prior weights (g, OWN + 3 k) of the unknowns."""
         prior = np.zeros((len(rows), OWN + 3 * near.shape[1]))
+        prior[:, :TERMS] = self.background.prior(rows)
         prior[:, TERMS + 2] = self._depth_sd(rows, near) ** -2.0
         # An absent neighbour has no derivatives; any prior keeps its step zero.
         prior[:, OWN::3] = prior[:, OWN + 1 :: 3] = NEIGHBOUR_SD_PX**-2
@@ -434,15 +440,14 @@ def _textured_slope(fit: ShadowFit) -> NDArray[np.float64]:
         textured = fit.texture.strength[group[0]] > 0
         rows, near = group[0][textured], group[1][textured]
         light, _ = fit._model(rows, near)
-        grey = fit.grey[rows]
-        weight = fit._valid(rows, grey, light) / fit.noise.variance(light)
+        residual, weight, _ = fit._observed(rows, light)
         relative = fit.background.relative(rows, light)
         for cosines, own in fit.texture.in_windows(rows):
             expected = cosines.expected(
                 fit.texture.strength[rows[own]],
                 relative[own],
                 weight=weight[own],
-                residual=(grey - light)[own],
+                residual=residual[own],
             )
             slope[rows[own]] += expected @ plane / fit.background.light[rows[own], None]
     return slope

@@ -151,10 +151,11 @@ class Cosines:
         cross = products[:, :unknowns, unknowns:]
         explained = np.swapaxes(cross, 1, 2) @ (np.linalg.inv(normal) @ cross)
         reduced = products[:, unknowns:, unknowns:] - explained
-        noise = 1 / np.maximum(np.mean(weight, axis=1), 1e-12)
+        seen = np.count_nonzero(weight, axis=1)
+        noise = np.maximum(seen, 1) / np.maximum(np.sum(weight, axis=1), 1e-12)
         reduced[:, :-1] *= np.sqrt(noise)[:, None, None]
         reduced[:, :, :-1] *= np.sqrt(noise)[:, None, None]
-        freedom = np.maximum(np.count_nonzero(weight, axis=1) - unknowns, 1)
+        freedom = np.maximum(seen - unknowns, 1)
         return Spectra(reduced, freedom, noise)
 
     def eliminated(

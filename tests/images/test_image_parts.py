@@ -12,18 +12,19 @@ import pytest
 from scipy.signal import convolve2d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images import matching
-from fluoro_calib_ros.images.background import TERMS
+from fluoro_calib_ros.images.background import TERMS, Background, HiddenLight
+from fluoro_calib_ros.images.clipping import Clipping
 from fluoro_calib_ros.images.growth import Match
 from fluoro_calib_ros.images.light import (
     LAGS,
     Light,
     Noise,
     _seen_by,
-    clipped_at,
     correlation_of,
     estimate_noise,
     less_common,
@@ -266,8 +267,77 @@ def test_correlation_of_residuals_counts_valid_pairs():
 def test_clipped_values_are_more_frequent_than_those_beside():
     rng = np.random.default_rng(6)
     grey = np.clip(np.rint(rng.normal(500, 100, (100, 100))), 300, 650)
-    assert clipped_at(grey) == (300, 650)
-    assert clipped_at(np.rint(rng.normal(500, 100, (100, 100)))) == (-np.inf, np.inf)
+    assert Clipping.of(grey) == Clipping(300, 650)
+    assert not Clipping.of(np.rint(rng.normal(500, 100, (100, 100))))
+
+
+@pytest.mark.parametrize('quality', [15, 30, 60])
+def test_clipped_values_are_found_after_compression_with_losses(quality):
+    rng = np.random.default_rng(7)
+    light = 420 - 400 * np.exp(-0.5 * ((np.mgrid[:96, :96] - 48) ** 2).sum(axis=0) / 8**2)
+    image = np.clip(rng.normal(light, 6), 0, 255).astype(np.uint8)
+    _, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE).astype(np.float32)
+    high = Clipping.of(grey).high
+    assert 252 <= high <= 255
+    assert np.mean(grey >= high) == pytest.approx(np.mean(image == 255), abs=0.05)
+
+
+def test_steps_with_clipped_pixels_are_those_of_newton():
+    light = np.linspace(60, 140, 9)
+    grey = np.full(9, 100.0)
+    variance = np.full(9, 15.0**2)
+    step = 1e-3
+    for clipping, beyond in ((Clipping(high=100), 1), (Clipping(low=100), -1)):
+        residual, information = clipping.observed(grey, light, variance)
+
+        def log_likelihood(light):
+            return norm.logcdf((beyond * (light - 100) + 0.5) / 15)
+
+        before, at, after = (log_likelihood(light + one) for one in (-step, 0, step))
+        first = (after - before) / (2 * step)
+        second = (before - 2 * at + after) / step**2
+        used = information > 0
+        assert used.sum() == 8
+        np.testing.assert_allclose((residual * information / variance)[used], first[used], 1e-5)
+        np.testing.assert_allclose((information / variance)[used], -second[used], rtol=1e-4)
+
+
+def test_light_beyond_the_bound_is_estimated_without_bias():
+    rng = np.random.default_rng(8)
+    for true in (90.0, 100.0, 110.0):
+        grey = np.minimum(np.rint(rng.normal(true, 10, 40_000)), 100)
+        light = 100.0
+        for _ in range(20):
+            residual, information = Clipping(high=100).observed(
+                grey, np.full(grey.shape, light), np.full(grey.shape, 100.0)
+            )
+            light += (residual @ information) / information.sum()
+        assert light == pytest.approx(true, abs=0.3)
+
+
+def test_spread_of_hidden_light_is_that_of_the_windows():
+    rng = np.random.default_rng(9)
+    count = 400
+    spread = np.array([0.05, 0.05, 0.2, 0.2, 0.2])
+    background = Background(count, window_offsets(8.0), 8.0)
+    terms = rng.normal(0, spread, (count, TERMS - 1))
+    # Half of the windows hardly determine their terms.
+    sd = np.where(np.arange(count) % 2, 0.02, 2.0)[:, None]
+    observed = terms + rng.normal(0, sd, terms.shape)
+    normal = np.tile(np.eye(TERMS + 3), (count, 1, 1))
+    normal[:, range(1, TERMS), range(1, TERMS)] = sd**-2.0
+    right = np.zeros((count, TERMS + 3))
+    right[:, 1:TERMS] = observed / sd**2
+    hidden = HiddenLight(count)
+    hidden.note(np.arange(count), normal, right, background)
+    found = hidden.spread(np.ones(count, bool), 1.0)
+    np.testing.assert_allclose(found, spread, rtol=0.15)
+    background.spread = found
+    noted = normal.copy()
+    noted[:, range(1, TERMS), range(1, TERMS)] += background.prior(np.arange(count))[:, 1:]
+    hidden.note(np.arange(count), noted, right, background)
+    np.testing.assert_allclose(hidden.spread(np.ones(count, bool), 1.0), found, rtol=1e-6)
 
 
 # ---- fits of shadows
@@ -412,12 +482,14 @@ def test_windows_begin_with_the_upper_quartile_and_need_most_of_their_pixels():
 
 def test_clipped_pixels_do_not_count_where_they_agree():
     fit = fit_of()
-    fit.valid[:] = True
-    fit.low, fit.high = 50.0, 150.0
-    grey = np.array([[50.0, 150.0, 50.0, 150.0, 100.0]])
-    light = np.array([[40.0, 170.0, 60.0, 140.0, 100.0]])
+    fit.clipping = Clipping(50.0, 150.0)
+    fit.grey = np.array([[50.0, 150.0, 50.0, 150.0, 100.0]], np.float32)
     fit.valid = np.ones((1, 5), bool)
-    assert fit._valid(np.array([0]), grey, light).tolist() == [[False, False, True, True, True]]
+    light = np.array([[10.0, 190.0, 90.0, 110.0, 100.0]], np.float32)
+    residual, weight, information = fit._observed(np.array([0]), light)
+    assert weight[0, :2].tolist() == [0, 0]
+    np.testing.assert_allclose(residual[0, 2:], [-40, 40, 0], atol=2.0)
+    np.testing.assert_allclose(information[0, 2:], 1, atol=0.1)
 
 
 def test_typical_lack_of_fit_is_the_median_of_usable_beads():

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fluoro_calib_ros.images.clipping import Clipping
 from fluoro_calib_ros.images.detection import field_of_view
 from fluoro_calib_ros.images.imaging import (
     Expected,
@@ -434,7 +435,7 @@ def test_an_unsharp_mask_is_estimated_if_there_is_one(factor, scatter, clipped):
     image = image + factor * (image - cv2.GaussianBlur(image, (0, 0), 2.5))
     high = np.sort(image, axis=None)[-1 - clipped] if clipped else np.inf
     image = np.minimum(image, high)
-    light = Light(image, np.ones(image.shape, bool), high=high)
+    light = Light(image, np.ones(image.shape, bool), Clipping(high=high))
     noise = estimate_noise(image, light.field)
     imaging = first_imaging(light, noise, shadows, RADIUS, size=np.ones(36))
     profile = imaging.profile

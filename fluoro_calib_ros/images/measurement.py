@@ -320,10 +320,11 @@ class BeadFit(ShadowFit):
         plane = self.background.direct(every) + self.background.scattered(every)
         x, y = np.moveaxis(self.middle[:, None] + self.offset - self.uv[:, None], 2, 0)
         distance = np.sqrt(self._squared(every, x, y))
-        known = self.valid & self.clipping.leaves(self.grey)
         light = np.empty_like(self.grey)
         for rows, near in self.groups:
             light[rows] = self._model(rows, near)[0]
+        # Omitting the pixels that are clipped would keep those on which noise has the other sign.
+        known = self.valid & self.clipping.leaves(light)
         good = (
             known & (self.measured & (self.misfit < UNDISTURBED * np.median(self.misfit)))[:, None]
         )

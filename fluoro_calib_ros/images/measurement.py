@@ -323,8 +323,8 @@ class BeadFit(ShadowFit):
         light = np.empty_like(self.grey)
         for rows, near in self.groups:
             light[rows] = self._model(rows, near)[0]
-        # Omitting the pixels that are clipped would keep those on which noise has the other sign.
-        known = self.valid & self.clipping.leaves(light)
+        # Where the expected light is clipped, only pixels with noise of one sign are not.
+        known = self.valid & self.clipping.leaves(light) & self.clipping.leaves(self.grey)
         good = (
             known & (self.measured & (self.misfit < UNDISTURBED * np.median(self.misfit)))[:, None]
         )

@@ -128,6 +128,8 @@ def _profile_fit(
     shape, size = shapes
     fit = BeadFit(light, uv, shape, profile=profile, noise=noise, size=size, reach_px=reach_px)
     fit.background.plane_only = True
+    fit.hidden = None
+    fit.background.spread[:] = np.inf
     fit.run(PROFILE_STEPS)
     return fit
 

@@ -44,7 +44,7 @@ SETTINGS = FitSettings(
     pooled=120.0,
     crossed=1.2,
 )
-STEPS_ALONE = 2  # steps of isolated markers
+STEPS_ALONE = 2  # steps of isolated markers, if clipped pixels do not hide the light
 CONVERGED_PX = 0.1  # length of the last step from which another step follows
 WAY_PX = 2.0  # length of the largest motion for each further quadrature point
 
@@ -111,6 +111,7 @@ class _MarkerFit(ShadowFit):
         )
         self.guess = guess
         self.offset_u, self.offset_v = np.ascontiguousarray(self.offset.T, dtype=DTYPE)
+        self.clipping = windows.clipping
         grey, valid = windows.read(self.middle, self.offset)
         self._set_windows(grey, valid, bright=grey)
         self._set_groups(self._near(2 * reach + MARGIN_PX))
@@ -129,8 +130,9 @@ class _MarkerFit(ShadowFit):
         for step in range(self.settings.steps):
             if step in self.settings.crossing_steps:
                 self._cross()
+            self._renew_prior(step)
             for rows, near in self.groups:
-                alone = not near.shape[1]
+                alone = not near.shape[1] and not self.hidden
                 if alone and step >= STEPS_ALONE:
                     continue
                 final = step == (STEPS_ALONE if alone else self.settings.steps) - 1

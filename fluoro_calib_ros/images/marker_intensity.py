@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
+from .clipping import UNCLIPPED, Clipping
 from .detection import (
     BLOB_RADIUS,
     MIN_SIZE,
@@ -80,6 +81,7 @@ class MarkerLook:
     strength: float  #: response to a typical marker over the light around it
     floor: float  #: response below which noise is likely, at the usual light
     light: float  #: usual light: the median in the field
+    clipping: Clipping = UNCLIPPED  #: of the light
 
     @property
     def radius_px(self) -> float:
@@ -173,6 +175,7 @@ class LightWindows:
         self._all = bool(look.field.all())
         self.shape = image.shape
         self._white = look.white
+        self.clipping = look.clipping
 
     def read(
         self, middle: NDArray[np.int64], offset: NDArray[np.int64]
@@ -327,6 +330,7 @@ class _Typical:
             strength=self.strength,
             floor=self.floor,
             light=max(light.usual, 1.0),
+            clipping=Clipping.of(light.light),
         )
 
 
@@ -429,9 +433,12 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         MarkerStates.start(Motion.start(place, GIVEN_SD_PX), unseen),
         look,
         profile=estimate_profile(
-            Light(light, look.field), place[seen], circles(np.ones(len(seen))), look.radius_px
+            Light(light, look.field, look.clipping),
+            place[seen],
+            circles(np.ones(len(seen))),
+            look.radius_px,
         ),
-        noise=estimate_noise(light, look.field),
+        noise=estimate_noise(light, look.field & look.clipping.leaves(light)),
         size=(width, height),
         density=max((len(shadows.uv) - len(row)) / max(look.field.sum(), 1), MIN_DENSITY),
     )

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from .background import TERMS, HiddenLight
+from .background import TERMS
 from .fine_grid import Absorbers, FineGrid
 from .light import Light, Noise, less_common
 from .profile import Absorbed, Profile, Shadows
@@ -43,8 +43,6 @@ SETTINGS = FitSettings(
 )
 STEPS = SETTINGS.steps
 FIRST_STEPS = 3  # steps that only have to separate beads from other objects
-HIDDEN = 0.5  # share of clipped pixels beyond which they hide the light of a window
-HIDDEN_STEP = 2  # step from which light that clipped pixels hide has a prior
 # Largest step of a coordinate of a bead that has converged: the next step is about ten times
 # shorter, and the centres of the sharpest beads are known to 0.01 px.
 SETTLED_PX = 0.003
@@ -118,7 +116,6 @@ class BeadFit(ShadowFit):
             SETTINGS, profile, noise=noise, uv=uv, depth=np.ones(len(uv)), window_px=window
         )
         self.radius = self.stretch * self.size
-        self.hidden: HiddenLight | None = None
         self.disturbed = np.zeros(len(uv), dtype=bool)
         self.settled = np.zeros(len(uv), dtype=bool)
         self.moved = np.zeros(len(uv))  # RMS shift of u and v by relative errors 1 of radii [px]
@@ -154,9 +151,6 @@ class BeadFit(ShadowFit):
         bright = np.where(valid, grey, 0.0)
         self._set_windows(grey, valid & own, bright=bright, around=light.around(self.uv))
         self.usable = self.valid.sum(axis=1) >= MIN_INSIDE * own.sum(axis=1)
-        clipped = self.valid & ~self.clipping.leaves(grey)
-        if (clipped.sum(axis=1) > HIDDEN * self.valid.sum(axis=1)).any():
-            self.hidden = HiddenLight(len(self.uv))
         # If part of the border is missing, a shadow that is not quite that of a sphere moves.
         from_edge = np.minimum(self.uv, (width - 1, height - 1) - self.uv).min(axis=1)
         self.usable &= from_edge >= self.profile.radius_px * self.radius
@@ -172,9 +166,7 @@ class BeadFit(ShadowFit):
             final = step == steps - 1
             if step in self.settings.crossing_steps:
                 active |= self._cross()
-            if self.hidden and step >= HIDDEN_STEP and not self.background.plane_only:
-                self.background.spread = self.hidden.spread(self.usable, self.typical())
-                active[:] = True
+            active |= self._renew_prior(step)
             groups = []
             for rows, near in self.groups:
                 chosen = active[rows] | (final and near.shape[1] > 0)
@@ -274,8 +266,6 @@ class BeadFit(ShadowFit):
         final: bool,
     ) -> np.ndarray:
         step = np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
-        if self.hidden and not self.background.plane_only:
-            self.hidden.note(rows, equations.matrix, equations.right, self.background)
         # The step reduces the squared residuals by its product with the right side.
         self.settled[rows] = (np.abs(step[:, TERMS : TERMS + 2]) <= SETTLED_PX).all(axis=1)
         self.settled[rows] &= (step * equations.right).sum(axis=1) <= self.misfit[rows]

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .background import TERMS, Background
+from .background import START_SPREAD, TERMS, Background, HiddenLight
 from .clipping import UNCLIPPED
 from .light import MIN_PIXELS, Noise, correlation_of, less_common
 from .profile import Profile
@@ -33,6 +33,7 @@ NEIGHBOUR_SD_PX = 1.0
 NEIGHBOUR_SD = 0.2
 DEPTH_SD = 1.0  # prior standard deviation of the depth of a shadow, which is 1 for the profile
 DEPTHS = (0.05, 3.0)  # bounds of the depth; a shadow removes light
+HIDDEN = 0.5  # share of clipped pixels beyond which they hide the light of a window
 MIN_PASSED = 0.02  # least share of the light behind a bead: derivatives are divided by it
 MIN_INSIDE = 0.6  # least share of a window inside the field
 # Share of the blur that draws shadows towards less light, and its standard deviation. That of the
@@ -146,6 +147,7 @@ class ShadowFit(ABC):
         self.misfit = np.full(n, np.inf)
         self.distance = np.full(n, np.inf)  # distance of the nearest bead
         self.clipping = UNCLIPPED
+        self.hidden: HiddenLight | None = None
         self.crossing: np.ndarray | None = None
         self.texture = Texture.none(n, self.offset, (profile.sharpening, profile.mask_px))
         self.groups: list[Group] = []
@@ -168,6 +170,10 @@ class ShadowFit(ABC):
         place = int(0.75 * len(self.offset))
         light = np.partition(bright, place, axis=1)[:, place]
         self.background.start(light, around, self.profile.scatter)
+        clipped = valid & ~self.clipping.leaves(grey)
+        if self.clipping and (clipped.sum(axis=1) > HIDDEN * valid.sum(axis=1)).any():
+            self.hidden = HiddenLight(len(valid))
+            self.background.spread[:] = START_SPREAD
 
     def _set_groups(self, near: np.ndarray) -> None:
         """Group beads by the number of their neighbours near (n, k), -1 for none, nearest first.
@@ -273,9 +279,17 @@ class ShadowFit(ABC):
         self.misfit[rows] = total / np.maximum(information.sum(axis=1) - OWN, 1)
         valid = information > KNOWN
         standardised = np.sqrt(squared) * np.sign(residual) * valid
+        if self.hidden:
+            self.hidden.note(rows, normal, right, self.background)
         return NormalEquations(
             normal, plain, right, weighted=weighted, residual=standardised, valid=valid
         )
+
+    def _renew_prior(self, step: int) -> bool:
+        """Renew the prior of light that clipped pixels hide, if any; return whether it changed."""
+        if self.hidden and step:
+            self.background.spread = self.hidden.spread(self.usable, self.typical())
+        return self.hidden is not None
 
     def _add_texture(self) -> None:
         """Add a background beyond the polynomial to beads whose pixels show one."""
@@ -284,7 +298,7 @@ class ShadowFit(ABC):
         plain = plain[:: len(plain) // CORRELATED + 1]
         usual = self.misfit[rows] <= DISTURBED * self.typical()
         residual = less_common(self.uv[rows], self.radius[rows], residual, valid, usual)
-        self.correlation = self._correlation(residual[plain], valid[plain])
+        self.correlation = _correlation(self, residual[plain], valid[plain])
         rest = residual / np.maximum(root, DTYPE(1e-12))
         ends = np.cumsum([len(jacobian) for jacobian in jacobians])[:-1]
         arrays = relative, root**2, rest
@@ -307,17 +321,6 @@ class ShadowFit(ABC):
         root = np.sqrt(weight, dtype=DTYPE)
         relative = self.background.relative(rows, light)
         return (rows, relative, residual * root, root, information > KNOWN), list(jacobians)
-
-    def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
-        """Return the correlation of the noise from standardised residuals (g, m) of windows.
-
-        The residuals contain errors of the model. The other estimate, from the background of the
-        image, contains the shadows of dense beads. The smaller one has less of either.
-        """
-        if valid.sum() < MIN_PIXELS:
-            return self.noise.correlation
-        of_windows = correlation_of(self._images(residual), self._images(valid))
-        return min(of_windows, self.noise.correlation, key=np.sum)
 
     def _observed(
         self, rows: NDArray[np.int64], light: NDArray[np.floating]
@@ -368,13 +371,6 @@ class ShadowFit(ABC):
             self.influence = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
         return inverse
 
-    def _images(self, windows: np.ndarray) -> NDArray[np.float64]:
-        """Return square images (g, w, w) of round windows (g, m)."""
-        half = int(np.abs(self.offset).max())
-        images = np.zeros((len(windows), 2 * half + 1, 2 * half + 1))
-        images[:, self.offset[:, 1] + half, self.offset[:, 0] + half] = windows
-        return images
-
     def _beads(
         self, measured: NDArray[np.bool_], typical: float, noise: NDArray[np.float64] | None = None
     ) -> Beads:
@@ -393,7 +389,7 @@ class ShadowFit(ABC):
         pooled = (noise * pixels + usual * freedom) / (pixels + freedom)
         if self.influence is not None:
             # Correlated noise of neighbouring pixels adds up.
-            self.inflation = _inflation(self._images(self.influence), self.correlation)
+            self.inflation = _inflation(_images(self.offset, self.influence), self.correlation)
         by_correlation = ((self.inflation or 1.0) - 1) * self.noise_sigma**2
         factor = np.sqrt(np.maximum(pooled, usual))
         # Where shadows touch, the model errs by more than the noise of the pixels suggests.
@@ -451,6 +447,26 @@ def _textured_slope(fit: ShadowFit) -> NDArray[np.float64]:
             )
             slope[rows[own]] += expected @ plane / fit.background.light[rows[own], None]
     return slope
+
+
+def _correlation(fit: ShadowFit, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
+    """Return the correlation of the noise from standardised residuals (g, m) of windows.
+
+    The residuals contain errors of the model. The other estimate, from the background of the
+    image, contains the shadows of dense beads. The smaller one has less of either.
+    """
+    if valid.sum() < MIN_PIXELS:
+        return fit.noise.correlation
+    of_windows = correlation_of(_images(fit.offset, residual), _images(fit.offset, valid))
+    return min(of_windows, fit.noise.correlation, key=np.sum)
+
+
+def _images(offset: NDArray[np.int64], windows: np.ndarray) -> NDArray[np.float64]:
+    """Return square images (g, w, w) of round windows (g, m); offset: (m, 2) their pixels."""
+    half = int(np.abs(offset).max())
+    images = np.zeros((len(windows), 2 * half + 1, 2 * half + 1))
+    images[:, offset[:, 1] + half, offset[:, 0] + half] = windows
+    return images
 
 
 def _within(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:

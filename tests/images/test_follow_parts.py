@@ -19,6 +19,7 @@ from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import following, marker_ids, matching
+from fluoro_calib_ros.images.clipping import UNCLIPPED, Clipping
 from fluoro_calib_ros.images.fine_grid import Absorbers, FineGrid
 from fluoro_calib_ros.images.lattice import GridPose
 from fluoro_calib_ros.images.light import LAGS, Light, Noise
@@ -81,6 +82,10 @@ def test_beads_that_touch_are_where_they_are_without_noise(apart):
     np.testing.assert_allclose(found.depth, 1.0, atol=0.01)
 
 
+def looked(image, clipping=UNCLIPPED):
+    return Fake(field=np.ones(image.shape, bool), white=None, clipping=clipping)
+
+
 @pytest.mark.parametrize(
     ('apart', 'motion'), [(4.0, (0.0, 0.0)), (10.0, (0.0, 0.0)), (7.0, (2.0, -1.0))]
 )
@@ -90,7 +95,7 @@ def test_markers_that_touch_are_where_they_are_without_noise(apart, motion):
         ways = (np.arange(8) - 3.5)[:, None] / 8 * motion
         light = light_behind(places, 5.0, 1.2, 0.9, ways)
     image = np.rint(light).astype(np.uint16)
-    windows = LightWindows(image, Fake(field=np.ones(image.shape, bool), white=None))
+    windows = LightWindows(image, looked(image))
     guess = MarkerGuess(
         places + [[0.4, -0.3], [-0.3, 0.3], [0.3, 0.3]],
         np.ones(3),
@@ -101,6 +106,26 @@ def test_markers_that_touch_are_where_they_are_without_noise(apart, motion):
     assert found.measured.all() and found.overlapped.tolist() == [True, True, False]
     np.testing.assert_allclose(found.uv, places, atol=0.05)
     np.testing.assert_allclose(found.depth, 1.0, atol=0.03)
+
+
+def test_markers_beside_light_that_is_clipped_have_honest_sigmas():
+    """The light increases across the marker, and a third of its window is clipped."""
+    rng = np.random.default_rng(5)
+    place = np.array([[20.3, 20.6]])
+    profile, noise = Profile(5.0, 1.2, 0.9), Noise(0.1, 1.0, WHITE)
+    x = np.arange(41) - 20
+    light = 820 * np.exp(0.01 * x) * light_behind(place, 5.0, 1.2, 0.9)[:41, :41] / 20000
+    errors = {clipping: [] for clipping in (UNCLIPPED, Clipping(high=850.0))}
+    for _ in range(40):
+        image = np.minimum(rng.poisson(light), 850).astype(np.uint16)
+        start = place + rng.normal(0, 0.2, (1, 2))
+        guess = MarkerGuess(start, np.ones(1), np.full(1, 0.2), np.zeros((1, 2)))
+        for clipping, normalised in errors.items():
+            windows = LightWindows(image, looked(image, clipping))
+            found = fit_markers(windows, guess, profile, noise, {})
+            normalised.append((found.uv - place)[0] / found.sigma)
+    without, honest = (np.sqrt(np.mean(np.square(values))) for values in errors.values())
+    assert 0.8 < honest < 1.25 < without
 
 
 @pytest.mark.parametrize('blur', [0.5, 2.0])

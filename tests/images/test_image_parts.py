@@ -48,6 +48,8 @@ from fluoro_calib_ros.images.shadow_fit import (
     OWN,
     FitSettings,
     ShadowFit,
+    _correlation,
+    _images,
     _inflation,
     _sd_of_centre,
 )
@@ -416,7 +418,8 @@ def test_correlation_of_the_noise_is_the_smaller_one_of_windows_and_background()
     fit = fit_of(40)
     rng = np.random.default_rng(12)
     white = rng.normal(size=(40, len(fit.offset)))
-    blurred = np.stack([fit._images(white)[:, 1:, :], fit._images(white)[:, :-1, :]]).sum(axis=0)
+    images = _images(fit.offset, white)
+    blurred = np.stack([images[:, 1:, :], images[:, :-1, :]]).sum(axis=0)
     smooth = np.pad(blurred, ((0, 0), (0, 1), (0, 0)))
     half = int(np.abs(fit.offset).max())
     correlated = smooth[:, fit.offset[:, 1] + half, fit.offset[:, 0] + half]
@@ -425,10 +428,10 @@ def test_correlation_of_the_noise_is_the_smaller_one_of_windows_and_background()
     background[LAGS, LAGS] = 1.0
     background[LAGS + 1, LAGS] = background[LAGS - 1, LAGS] = 0.2
     fit.noise = Noise(4.0, 0.0, background)
-    assert fit._correlation(white, valid).sum() < 1.2
-    assert fit._correlation(correlated, valid) is background
+    assert _correlation(fit, white, valid).sum() < 1.2
+    assert _correlation(fit, correlated, valid) is background
     # Too few pixels give no estimate.
-    assert fit._correlation(white[:2], valid[:2]) is background
+    assert _correlation(fit, white[:2], valid[:2]) is background
 
 
 @pytest.mark.parametrize('neighbours', [0, 2])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.images.clipping import UNCLIPPED
 from fluoro_calib_ros.images.detection import Look, detect_beads, field_of_view
 from fluoro_calib_ros.images.light import LAGS, Light, Noise, estimate_noise
 from fluoro_calib_ros.images.marker_fit import MarkerGuess, fit_markers
@@ -234,7 +235,9 @@ def test_windows_are_read_as_the_image_is_beyond_its_edges_too():
     field[60:70, 80:95] = False
     offset = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-4, 5)), axis=-1).reshape(-1, 2)
     for inverted in (False, True):
-        windows = LightWindows(image, Fake(field=field, white=65535 if inverted else None))
+        windows = LightWindows(
+            image, Fake(field=field, white=65535 if inverted else None, clipping=UNCLIPPED)
+        )
         expected = np.pad(65535 - image if inverted else image, 9, mode='edge')
         inside = np.pad(field, 9)
         for middle in ([50, 30], [4, 4], [3, 70], [70, 3], [225, 145], [226, 80], [100, 146],
@@ -279,7 +282,9 @@ def guess_of(uv, motion=(0.0, 0.0)):
 
 def fitted(image, uv, motion=(0.0, 0.0), inverted=False, unit=1.0):
     white = 65535 if inverted else None
-    windows = LightWindows(image, Fake(field=np.ones(image.shape, bool), white=white))
+    windows = LightWindows(
+        image, Fake(field=np.ones(image.shape, bool), white=white, clipping=UNCLIPPED)
+    )
     return fit_markers(windows, guess_of(uv, motion), PROFILE, Noise(0.0, 0.2 * unit, WHITE), {})
 
 

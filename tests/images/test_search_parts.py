@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import growth, matching, pose_search
+from fluoro_calib_ros.images.clipping import UNCLIPPED
 from fluoro_calib_ros.images.detection import PIXELS_AT_ONCE, responses
 from fluoro_calib_ros.images.growth import (
     Seen,
@@ -462,7 +463,9 @@ def test_windows_of_light_end_at_the_border(inverted):
     field[3, 4] = False
     offset = np.array([[0, 0], [-1, 0], [1, 2]])
     for middle in ([[4, 3]], [[5, 3], [2, 2]], [[0, 0]], [[7, 5], [4, 3]], [[6, 3]], [[2, 4]]):
-        reader = LightWindows(image, Fake(field=field, white=255 if inverted else None))
+        reader = LightWindows(
+            image, Fake(field=field, white=255 if inverted else None, clipping=UNCLIPPED)
+        )
         grey, valid = reader.read(np.array(middle), offset)
         for place, greys, valids in zip(np.array(middle), grey, valid):
             for (u, v), value, there in zip(place + offset, greys, valids):

@@ -27,7 +27,9 @@ DARK = 1e-3  # grey value below which light cannot be distinguished from none
 LARGE = 0.1  # relative change of direct light that differs from that of its logarithm
 HELD = 1e12  # prior weight that keeps a term at zero
 MAX_FACTOR = 20.0  # largest factor on the direct light in a step
-EM_STEPS = 50  # iterations after which widths of priors have converged to 5 %
+# Iterations after which the spread of terms has converged if half of the windows determine them to
+# it; if none does, the spread is still up to 1.5 times too large.
+EM_STEPS = 50
 SLOPES = slice(0, 2)  # of the terms but the constant one
 CURVATURES = slice(2, TERMS - 1)
 START_SPREAD = 0.3  # initial standard deviation of the terms; EM reaches smaller ones from it

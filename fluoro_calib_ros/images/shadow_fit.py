@@ -170,10 +170,11 @@ class ShadowFit(ABC):
         place = int(0.75 * len(self.offset))
         light = np.partition(bright, place, axis=1)[:, place]
         self.background.start(light, around, self.profile.scatter)
-        clipped = valid & ~self.clipping.leaves(grey)
-        if self.clipping and (clipped.sum(axis=1) > HIDDEN * valid.sum(axis=1)).any():
-            self.hidden = HiddenLight(len(valid))
-            self.background.spread[:] = START_SPREAD
+        if self.clipping:
+            clipped = valid & ~self.clipping.leaves(grey)
+            if (clipped.sum(axis=1) > HIDDEN * valid.sum(axis=1)).any():
+                self.hidden = HiddenLight(len(valid))
+                self.background.spread[:] = START_SPREAD
 
     def _set_groups(self, near: np.ndarray) -> None:
         """Group beads by the number of their neighbours near (n, k), -1 for none, nearest first.

@@ -32,6 +32,9 @@ REACH = 0.3  # largest distance of a bead from its place, over the distance betw
 MIN_ANGLE = np.deg2rad(35.0)  # least angle between the steps of a lattice, also in an oblique view
 CENTRAL = 8  # number of beads in the middle from which a search starts
 MIN_NUMBERED = 0.6  # share of the beads that a numbering must reach
+# Relative reduction of a squared step that is not a rounding error: of a hexagonal lattice, three
+# steps are equally long.
+SHORTER = 1e-9
 GAP = 2  # half the width of the largest gap, in missing beads
 SHIFTS = 6  # number of best shifts for each basis
 DEGREE = 3  # degree of the distortion during the refinement of a candidate
@@ -105,9 +108,10 @@ def _shortest_steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> ND
         if short @ short > long @ long:
             short, long, change = long, short, change[:, ::-1]
         times = round(float(short @ long / (short @ short)))
-        if times == 0:
+        shorter = long - times * short
+        if shorter @ shorter > (1 - SHORTER) * (long @ long):
             return index @ change
-        long = long - times * short
+        long = shorter
         change = change + np.outer(change[:, 1], [times, 0])
 
 

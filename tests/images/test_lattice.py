@@ -15,7 +15,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import lattice
 from fluoro_calib_ros.images.growth import Seen, settle
-from fluoro_calib_ros.images.lattice import number_lattice
+from fluoro_calib_ros.images.lattice import FlatGrid, number_lattice
 from fluoro_calib_ros.images.matching import PhantomModel, match
 from fluoro_calib_ros.images.view import Lens
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
@@ -174,6 +174,18 @@ def test_a_grid_is_told_whatever_the_frame_of_its_survey_is(turn):
     away = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
     assert np.mean(away < 1) > 0.97
     assert len(found.bead) > 0.9 * np.isfinite(true[:, 0]).sum()
+
+
+def test_a_hexagonal_sheet_with_a_blocked_hole_has_equally_long_steps():
+    """With rounding errors, the shortest two of its three steps had been exchanged for ever."""
+    i, j = np.mgrid[:20, :20].reshape(2, -1) - 9.5
+    xyz = np.column_stack([6 * (i + 0.5 * (j % 2)), 3 * np.sqrt(3) * j, np.zeros(400)])
+    for blocked in (163, 0, 210):
+        grid = FlatGrid.of(np.delete(xyz, blocked, axis=0))
+        places = np.delete(xyz, blocked, axis=0)[grid.lattice.row, :2]
+        terms = np.column_stack([grid.lattice.index, np.ones(len(places))])
+        steps = np.linalg.lstsq(terms, places, rcond=None)[0][:2]
+        np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 6.0, atol=1e-9)
 
 
 @pytest.mark.parametrize('steps', [SQUARE, HEXAGONAL])

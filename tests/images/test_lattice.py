@@ -179,7 +179,8 @@ def test_a_grid_is_told_whatever_the_frame_of_its_survey_is(turn):
 def test_a_hexagonal_sheet_with_a_blocked_hole_has_equally_long_steps():
     """With rounding errors, the shortest two of its three steps had been exchanged for ever."""
     i, j = np.mgrid[:20, :20].reshape(2, -1) - 9.5
-    xyz = np.column_stack([6 * (i + 0.5 * (j % 2)), 3 * np.sqrt(3) * j, np.zeros(400)])
+    y = 6 * j * (np.sqrt(3) / 2)
+    xyz = np.column_stack([6 * (i + 0.5 * (j % 2)), y, np.zeros(400)])
     for blocked in (163, 0, 210):
         grid = FlatGrid.of(np.delete(xyz, blocked, axis=0))
         places = np.delete(xyz, blocked, axis=0)[grid.lattice.row, :2]

@@ -247,9 +247,6 @@ class _Sight:
         if inverted:
             # Holes of a sheet are bright, but there is no light outside the field either.
             field &= field_of_view(grey, scale)
-        noise = self.noise
-        if inverted:
-            noise = estimate_noise(light, field & clipping.leaves(light))
         for wider in WIDER:
             blobs = _beads(self.blobs(wider * scale, inverted), field, self.typical)
             uv = blobs.uv
@@ -259,9 +256,10 @@ class _Sight:
                 if len(uv):
                     uv, radius = set_apart(light / _light_around(light, scale), uv)
             if len(uv):
+                unclipped = field & clipping.leaves(light)
                 return Detections(
                     Light(light, field, clipping),
-                    noise,
+                    estimate_noise(light, unclipped) if inverted else self.noise,
                     uv=uv,
                     scale=scale,
                     radius_px=radius or scale * BLOB_RADIUS,

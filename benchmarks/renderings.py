@@ -47,6 +47,8 @@ DISTANCE_MM = 900.0
 STEEL_PER_MM = 0.55  # attenuation at about 70 keV
 ACRYLIC_PER_MM = 0.022
 BONE_PER_MM = 0.05
+CABLE = 0.6  # light absorbed by a cable
+LETTERS = list('ABCDEFGHKLMNPRSTUVWXYZ0123456789 ')
 SHEET_MM = 1.5
 ENLARGED = 1.4  # diameter of an enlarged hole relative to the others
 SUB = 3  # rays per pixel in each direction
@@ -113,6 +115,10 @@ class Row:
     unsharp : float
         Strength of an unsharp mask.
     bone : bool
+    labels : bool
+        Black or white text in the corners of the image.
+    cables : int
+        Number of cables across the image.
     told : bool
         Whether the extraction knows the diameters.
     distortion_px : float
@@ -136,6 +142,8 @@ class Row:
     jpeg: int = 0
     unsharp: float = 0.0
     bone: bool = False
+    labels: bool = False
+    cables: int = 0
     told: bool = False
     holes: bool = False
     regular: bool = False
@@ -256,6 +264,11 @@ ROWS: dict[str, Row] = {
     'cube-36 plates': Row(cube(36), plates=5),
     'frame-503 plates': Row(frame(503), photons=4000.0, faces=70.0, tilt_deg=12.0),
     'cube-36 bone': Row(cube(36), bone=True),
+    'cube-36 labels': Row(cube(36), labels=True),
+    'cube-36 bone labels': Row(cube(36), bone=True, labels=True),
+    'cube-36 cables': Row(cube(36), cables=8),
+    'cube-36 bone cables': Row(cube(36), bone=True, cables=8),
+    'frame-503 labels': Row(frame(503), photons=4000.0, tilt_deg=12.0, labels=True),
     'cube-36 unsharp plates': Row(cube(36), unsharp=1.5, plates=5),
     'cube-36 unsharp bone': Row(cube(36), unsharp=1.5, bone=True),
     'cube-36 unsharp 3': Row(cube(36), unsharp=3.0),
@@ -299,6 +312,8 @@ ROWS: dict[str, Row] = {
     'bone without phantom': Row(nothing, bone=True, wanted=cube(36)),
     'hand': Row(nothing, anatomy='hand', wanted=cube(36)),
     'spine': Row(nothing, anatomy='spine', wanted=cube(36)),
+    'labels and cables': Row(nothing, labels=True, cables=8, wanted=cube(36)),
+    'spine with labels': Row(nothing, anatomy='spine', labels=True, wanted=cube(36)),
     'spine for sheet': Row(nothing, anatomy='spine', wanted=sheet(20, 6.0, False, 1)),
     'cube-48 for cube-36': Row(cube(48), wanted=cube(36)),
     'lego-48 for cube-36': Row(lego(48), wanted=cube(36)),
@@ -353,6 +368,8 @@ def render_with(
     if row.anatomy:
         depth += BONE_PER_MM * _skeleton(row.anatomy, rng)
     light = light * np.exp(-depth) * _vignetting(rng)
+    for _ in range(row.cables):
+        light *= 1 - CABLE * _cable(rng)
     grey = _detected(light, row, rng)
     return Scene(grey, target, uv, in_image(uv) & (_overlap(uv, target, centres) > 1.0))
 
@@ -574,6 +591,22 @@ def _spine(rng: np.random.Generator) -> Iterator[tuple[float, float, float, floa
             yield side * 150.0, y, 60.0, 14.0, 6.0
 
 
+def _cable(rng: np.random.Generator) -> np.ndarray:
+    """Return the share (h, w) of a straight cable of 2 to 12 px in pixels."""
+    ends = [(int(u), int(v)) for u, v in rng.uniform(0, SIZE, (2, 2))]
+    line = np.zeros(WHOLE)
+    cv2.line(line, ends[0], ends[1], 1.0, int(rng.integers(2, 12)))
+    return np.asarray(cv2.GaussianBlur(line, (0, 0), 1.0))
+
+
+def _label(image: NDArray[np.uint8], rng: np.random.Generator) -> None:
+    """Write text into the corners of an image."""
+    grey = int(rng.choice([0, 255]))
+    for place in ((8, 30), (8, 60), (700, 30), (8, 1010), (760, 1010)):
+        text = ''.join(rng.choice(LETTERS, int(rng.integers(8, 16))))
+        cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.9, grey, 2, cv2.LINE_AA)
+
+
 def _vignetting(rng: np.random.Generator) -> np.ndarray:
     v, u = _pixels() / SIZE - 0.5
     return 1 - rng.uniform(0.1, 0.4) * (u * u + v * v)
@@ -589,6 +622,8 @@ def _detected(light: np.ndarray, row: Row, rng: np.random.Generator) -> NDArray[
         grey = grey + row.unsharp * (grey - cv2.GaussianBlur(grey, (0, 0), 3))
     image = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
     image = np.ascontiguousarray(image[MARGIN:-MARGIN, MARGIN:-MARGIN])
+    if row.labels:
+        _label(image, rng)
     if row.jpeg:
         _, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, row.jpeg])
         image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)

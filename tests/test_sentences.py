@@ -549,7 +549,7 @@ MAKERS = {
     Kind.NO_POSE: no_pose,
     Kind.POSE_UNSURE: lambda: raised(
         matching._check_evidence,
-        Fake(explained=0.01, expected=90, found=0.9, bead=np.arange(60)),
+        Fake(explained=0.01, evidence=99.0, expected=90, found=0.9, bead=np.arange(60)),
     ),
     Kind.BEAD_ALONE: lambda: extraction.ALONE,
     Kind.BEAD_AWAY: lambda: bead(uv=9.0),
@@ -909,7 +909,9 @@ SENTENCES = {
     Kind.IMAGE_ENCODING: 'the image has pixels of float64, not of # or # bits',
     Kind.IMAGE_EMPTY: 'the image is empty: every pixel has the grey value #',
     Kind.NO_POSE: 'no pose of the phantom fits the beads in the image',
-    Kind.POSE_UNSURE: ('the best pose of the phantom explains only #% of the beads in the image'),
+    Kind.POSE_UNSURE: (
+        'the best pose of the phantom explains only #% of the beads in its outline'
+    ),
     Kind.BEAD_ALONE: 'its neighbours were not found',
     Kind.BEAD_AWAY: '# px from its prediction',
     Kind.BEAD_CONTRAST: 'a contrast of #% of that of a bead',

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import rel_entr
 
 from .pose_search import LocalPose
 from .view import TAIL, Lens, View, fit_view
@@ -79,9 +81,12 @@ class Match:
     #: (m, 2), predicted pixels of all beads of the phantom, with interpolated residuals
     predicted: NDArray[np.float64]
     found: float  #: share of the beads predicted in the field that are found
-    explained: float  #: share of the detections in the image that are predicted
+    #: share of the detections within the outline of the predicted beads that are predicted
+    explained: float
     scale_px: float  #: robust standard deviation of the residuals
     expected: int  #: number of beads predicted in the field
+    #: logarithm of the likelihood of the beads that are found, over that for detections anywhere
+    evidence: float
 
     @property
     def score(self) -> float:
@@ -216,6 +221,8 @@ def _judged(
     prediction_distance, _ = cKDTree(predicted[row]).query(
         seen.uv, distance_upper_bound=max(tolerance, 1.2 * seen.radius_px)
     )
+    within, area = _outlined(seen.uv, predicted[row], seen.field.shape)
+    by_chance = -float(np.expm1(-np.pi * tolerance**2 * within.sum() / area))
     good = _good_cells(predicted[row], is_found, seen.field.shape)
     # A detection between two predictions may belong to either.
     tree = cKDTree(predicted[row])
@@ -231,10 +238,37 @@ def _judged(
         detection=detection[accepted],
         predicted=predicted,
         found=float(np.mean(is_found)),
-        explained=float(np.mean(np.isfinite(prediction_distance))),
+        explained=float(np.isfinite(prediction_distance[within]).sum() / max(within.sum(), 1)),
         scale_px=scale,
         expected=len(row),
+        evidence=_evidence(is_found[spacing >= 2 * seen.radius_px], by_chance),
     )
+
+
+def _evidence(is_found: NDArray[np.bool_], by_chance: float) -> float:
+    """Return the log-likelihood ratio of predictions (n,) that are found, or are by chance.
+
+    by_chance: probability that something is detected next to any place.
+    """
+    share = float(np.mean(is_found)) if len(is_found) else 0.0
+    if share <= by_chance:
+        return 0.0
+    gain = rel_entr([share, 1 - share], [by_chance, 1 - by_chance])
+    return len(is_found) * float(np.sum(gain))
+
+
+def _outlined(
+    uv: NDArray[np.float64], predicted: NDArray[np.float64], shape: tuple[int, ...]
+) -> tuple[NDArray[np.bool_], int]:
+    """Return which pixels (n, 2) are within the outline of predictions (m, 2), and its area.
+
+    shape: that of the image. Labels, cables and screws beside the phantom are no evidence against
+    a pose.
+    """
+    outline = cv2.convexHull(np.rint(predicted).astype(np.int32))
+    inside = cv2.fillConvexPoly(np.zeros(shape, dtype=np.uint8), outline, 1)
+    column, row = np.rint(uv).astype(int).T
+    return inside[row, column].astype(bool), np.count_nonzero(inside)
 
 
 def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.bool_]:

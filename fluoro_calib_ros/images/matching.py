@@ -25,6 +25,7 @@ from ..photogrammetry.rotations import rotation_angle
 from .growth import LAST_TOLERANCE_PX, Match, Seen, grow, settle, start_view
 from .lattice import CENTRAL, REACH, STEPS, FlatGrid, GridPose, grid_poses
 from .pose_search import (
+    MERGED,
     MIN_EXPLAINED,
     MIN_FOUND,
     Triples,
@@ -41,6 +42,9 @@ MIN_BEADS = 10
 EVIDENT = ((MIN_FOUND, MIN_EXPLAINED), (0.6, 0.85))
 # Shares found and explained from which the search ends.
 SURE = ((0.85, MIN_EXPLAINED), (0.75, 0.95))
+# Least evidence of a pose: a million poses are tried, and one image in a million may show another
+# pose by chance.
+MIN_EVIDENCE = float(2 * np.log(1e6))
 # Least lead in score of the best pose over any other, as a share of the score and in beads. Beads
 # missed by chance make a smaller difference.
 MARGIN = 0.06
@@ -53,7 +57,7 @@ NEIGHBOURS = (8, 6)  # of a bead in phantom and image, which form triples with i
 LEVELS = (
     ((0, 8), (0.85, 1.4)),
     ((8, 80), (0.85, 1.4)),
-    ((0, 24), (0.6, 0.85)),
+    ((0, 24), (0.0, 0.85)),
     ((0, 6), (1.4, 3.0)),
 )
 FITTED = 12  # number of ways to fit a grid to detections; a hexagonal grid has so many symmetries
@@ -132,6 +136,11 @@ class PhantomModel:
         """Whether the sizes of the beads distinguish them."""
         diameter = self.diameter_mm
         return diameter is not None and np.ptp(diameter) >= MIN_SIZES * diameter.min()
+
+    @cached_property
+    def spacing_mm(self) -> float:
+        """Median distance of a bead from the nearest one."""
+        return float(np.median(cKDTree(self.xyz).query(self.xyz, k=[2])[0]))
 
     @cached_property
     def triples(self) -> Triples:
@@ -228,7 +237,7 @@ def _ambiguous(best: Match, other: Match) -> DataError:
 
 def is_sure(best: Match) -> bool:
     """Return whether no better match needs to be searched for."""
-    return any(best.found >= found and best.explained >= explained for found, explained in SURE)
+    return best.evidence >= MIN_EVIDENCE and _is_supported(best, SURE)
 
 
 def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
@@ -246,15 +255,22 @@ def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
 
 def is_evident(best: Match) -> bool:
     """Return whether enough predicted beads are found, and enough detections are predicted."""
-    return any(best.found >= found and best.explained >= explained for found, explained in EVIDENT)
+    return best.evidence >= MIN_EVIDENCE and _is_supported(best, EVIDENT)
+
+
+def _is_supported(best: Match, shares: Sequence[tuple[float, float]]) -> bool:
+    """Return whether a match has the shares found and explained of one of some pairs."""
+    return any(best.found >= found and best.explained >= explained for found, explained in shares)
 
 
 def _check_evidence(best: Match) -> None:
     """Raise DataError if too few predicted beads are found or too few detections are predicted."""
     if is_evident(best) and len(best.bead) >= MIN_BEADS:
         return
-    cause = f'explains only {best.explained:.0%} of the beads in the image'
-    if best.explained >= MIN_EXPLAINED or len(best.bead) < MIN_BEADS:
+    cause = f'explains only {best.explained:.0%} of the beads in its outline'
+    if _is_supported(best, EVIDENT) and len(best.bead) >= MIN_BEADS:
+        cause = 'may fit by chance'
+    elif best.explained >= MIN_EXPLAINED or len(best.bead) < MIN_BEADS:
         cause = (
             f'predicts {best.expected} beads in the image, of which only {best.found:.0%} are '
             'found'
@@ -266,6 +282,7 @@ def _check_evidence(best: Match) -> None:
             'expected': best.expected,
             'found': best.found,
             'explained': best.explained,
+            'evidence': best.evidence,
         },
     )
 
@@ -431,6 +448,7 @@ def seeds_of(seen: Seen) -> NDArray[np.int64]:
 def _scales(seen: Seen, model: PhantomModel, limits: tuple[float, float]) -> tuple[float, float]:
     """Return least and largest scale [px/mm]; limits: factors on the scale by extent."""
     low, high = (_scale_by_extent(seen, model) * factor for factor in limits)
+    low = max(low, MERGED * seen.radius_px / model.spacing_mm)
     if model.diameter_mm is None:
         return low, high
     by_size = 2 * seen.radius_px / float(np.median(model.diameter_mm))

@@ -380,6 +380,18 @@ def test_another_phantom_is_refused():
     assert lacks_certain_pose(error.value.finding)
 
 
+def test_labels_beside_the_phantom_do_not_hide_it():
+    xyz = np.random.default_rng(3).uniform(-30, 30, (36, 3))
+    beads = seen_of(xyz).uv
+    # Four lines of text, 24 characters each.
+    column = 20 + 15.0 * np.arange(24)
+    lines = [(x + dx, y) for dx, y in ((0, 30), (630, 60), (0, 970), (630, 1000)) for x in column]
+    seen = Seen.of(np.concatenate([beads, lines]), np.ones((1024, 1024), bool), 3.0)
+    found = match(seen, PhantomModel.of(xyz), LENS)
+    assert np.array_equal(found.bead, found.detection)
+    assert len(found.bead) > 30
+
+
 @pytest.mark.parametrize('shift_mm', [0.3, 12.0])
 def test_a_pose_nearby_is_followed(shift_mm):
     xyz = small_phantom(1)

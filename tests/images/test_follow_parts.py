@@ -717,7 +717,7 @@ def test_what_one_size_of_shadows_does_not_show_is_looked_for_with_another(monke
         (0.6, 0.85, 10, None),
         (0.6, 0.84, 40, 'of which only 60% are found'),
         (0.9, 0.9, 9, 'of which only 90% are found'),
-        (0.9, 0.39, 10, 'explains only 39% of the beads in the image'),
+        (0.9, 0.39, 10, 'explains only 39% of the beads in its outline'),
         (0.9, 0.39, 9, 'of which only 90% are found'),
         (0.3, 0.39, 10, 'explains only 39%'),
     ],
@@ -725,15 +725,28 @@ def test_what_one_size_of_shadows_does_not_show_is_looked_for_with_another(monke
 def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
     found, explained, beads, cause
 ):
-    best = Fake(found=found, explained=explained, bead=np.arange(beads), expected=30)
+    evidence = matching.MIN_EVIDENCE
+    best = Fake(
+        found=found,
+        explained=explained,
+        bead=np.arange(beads),
+        expected=30,
+        evidence=evidence,
+    )
     if cause is None:
         matching._check_evidence(best)
-        return
+        best.evidence = evidence - 0.1
+        cause = 'may fit by chance'
     with pytest.raises(DataError, match=cause) as told:
         matching._check_evidence(best)
     finding = told.value.finding
     assert finding.kind is Kind.POSE_UNSURE
-    assert finding.numbers == {'expected': 30, 'found': found, 'explained': explained}
+    assert finding.numbers == {
+        'expected': 30,
+        'found': found,
+        'explained': explained,
+        'evidence': best.evidence,
+    }
 
 
 def test_poses_are_compared_by_the_sizes_of_the_beads_that_all_of_them_have(monkeypatch):

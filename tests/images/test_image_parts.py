@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Finding, Kind
-from fluoro_calib_ros.images import matching
+from fluoro_calib_ros.images import growth, matching
 from fluoro_calib_ros.images.background import TERMS, Background, HiddenLight
 from fluoro_calib_ros.images.clipping import Clipping
 from fluoro_calib_ros.images.growth import Match
@@ -618,6 +618,7 @@ def found_match(number, scale_px, beads_of=40, turn=0):
         explained=0.9,
         scale_px=scale_px,
         expected=beads_of,
+        evidence=100.0,
     )
 
 
@@ -661,12 +662,26 @@ def test_of_two_poses_the_one_with_half_the_residuals_is_taken(monkeypatch):
 
 @pytest.mark.parametrize('limits, decide', [(EVIDENT, is_evident), (SURE, is_sure)])
 def test_evidence_of_a_pose_is_what_is_found_and_explained(limits, decide):
+    def pose(found, explained, evidence=28.0):
+        return Fake(found=found, explained=explained, evidence=evidence)
+
     for found, explained in limits:
-        assert decide(Fake(found=found, explained=explained))
+        assert decide(pose(found, explained))
+        assert not decide(pose(found, explained, evidence=27.0))
     (much, little), (few, most) = limits
-    assert not decide(Fake(found=much - 0.01, explained=most - 0.01))
-    assert not decide(Fake(found=few - 0.01, explained=1.0))
-    assert not decide(Fake(found=1.0, explained=little - 0.01))
+    assert not decide(pose(much - 0.01, most - 0.01))
+    assert not decide(pose(few - 0.01, 1.0))
+    assert not decide(pose(1.0, little - 0.01))
+
+
+def test_poses_that_detections_anywhere_explain_have_no_evidence():
+    # Hits of ten predictions where a twentieth of the places have a detection: 10 ln 20.
+    assert growth._evidence(np.ones(10, bool), 0.05) == pytest.approx(10 * np.log(20))
+    half = np.arange(10) < 5
+    expected = 10 * (0.5 * np.log(0.5 / 0.05) + 0.5 * np.log(0.5 / 0.95))
+    assert growth._evidence(half, 0.05) == pytest.approx(expected)
+    assert growth._evidence(half, 0.5) == 0
+    assert growth._evidence(half[:0], 0.1) == 0
 
 
 def test_scales_are_those_of_the_extent_and_of_the_size_of_beads():
@@ -674,11 +689,15 @@ def test_scales_are_those_of_the_extent_and_of_the_size_of_beads():
     xyz = rng.normal(0, 20.0, (4000, 3))
     uv = 500 + 3.0 * xyz[:, :2]
     seen = Fake(uv=uv, radius_px=6.0)
-    model = Fake(xyz=xyz, diameter_mm=None)
+    model = Fake(xyz=xyz, diameter_mm=None, spacing_mm=8.0)
     assert _scale_by_extent(seen, model) == pytest.approx(3.0, rel=0.03)
     low, high = _scales(seen, model, (0.85, 1.4))
     assert (low, high) == (pytest.approx(2.55, rel=0.03), pytest.approx(4.2, rel=0.03))
-    sized = Fake(xyz=xyz, diameter_mm=np.full(4000, 3.0))  # 12 px are 3 mm: 4 px/mm
+    # Beads of 6 px, 8 mm apart, are separate from 1.5 px/mm.
+    assert _scales(seen, model, (0.1, 1.4))[0] == pytest.approx(1.5)
+    sized = Fake(
+        xyz=xyz, diameter_mm=np.full(4000, 3.0), spacing_mm=8.0
+    )  # 12 px are 3 mm: 4 px/mm
     low, high = _scales(seen, sized, (0.5, 3.0))
     assert (low, high) == (pytest.approx(2.2), pytest.approx(6.4))
 

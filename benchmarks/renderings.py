@@ -115,6 +115,9 @@ class Row:
     unsharp : float
         Strength of an unsharp mask.
     bone : bool
+    levels : tuple of float
+        Grey values that are black and white after windowing.
+    logarithmic : bool
     labels : bool
         Black or white text in the corners of the image.
     cables : int
@@ -142,6 +145,8 @@ class Row:
     jpeg: int = 0
     unsharp: float = 0.0
     bone: bool = False
+    levels: tuple[float, float] = (0.0, 255.0)
+    logarithmic: bool = False
     labels: bool = False
     cables: int = 0
     told: bool = False
@@ -264,6 +269,9 @@ ROWS: dict[str, Row] = {
     'cube-36 plates': Row(cube(36), plates=5),
     'frame-503 plates': Row(frame(503), photons=4000.0, faces=70.0, tilt_deg=12.0),
     'cube-36 bone': Row(cube(36), bone=True),
+    'cube-36 windowed': Row(cube(36), levels=(90.0, 250.0)),
+    'cube-36 bone windowed': Row(cube(36), bone=True, levels=(90.0, 250.0)),
+    'cube-36 bone logarithmic': Row(cube(36), bone=True, logarithmic=True),
     'cube-36 labels': Row(cube(36), labels=True),
     'cube-36 bone labels': Row(cube(36), bone=True, labels=True),
     'cube-36 cables': Row(cube(36), cables=8),
@@ -620,6 +628,10 @@ def _detected(light: np.ndarray, row: Row, rng: np.random.Generator) -> NDArray[
     grey = row.gain * cv2.GaussianBlur(counted, (0, 0), 0.5)
     if row.unsharp:
         grey = grey + row.unsharp * (grey - cv2.GaussianBlur(grey, (0, 0), 3))
+    if row.logarithmic:
+        grey = 255 * np.log1p(np.maximum(grey, 0)) / np.log(256)
+    low, high = row.levels
+    grey = (grey - low) * (255 / (high - low))
     image = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
     image = np.ascontiguousarray(image[MARGIN:-MARGIN, MARGIN:-MARGIN])
     if row.labels:

@@ -271,19 +271,30 @@ def bead(**changes):
 def not_measured(n=20):
     view = Fake(outlines=lambda _: np.tile(np.eye(2), (n, 1, 1)))
     found = Fake(view=view, predicted=np.zeros((n, 2)), bead=np.arange(n), detection=np.arange(n))
+    light = Fake(above=lambda _: None)
     seen = Fake(uv=np.zeros((n, 2)), in_field=lambda uv: np.ones(n, bool), radius_px=1.0)
-    imaging = Fake(completed=lambda *_: imaging, size=np.ones(n), profile=None, noise=None)
+    imaging = Fake(
+        completed=lambda *_: imaging, size=np.ones(n), profile=None, noise=None, black=0
+    )
+    model = Fake(xyz=np.zeros((n, 3)))
     with mock.patch.multiple(
         extraction, measure_beads=mock.DEFAULT, _reasons=lambda *_: [extraction.LOST] * n
     ):
-        return raised(extraction._measured, Fake(light=None), seen, found, Fake(xyz=None), imaging)
+        return raised(extraction._measured, Fake(light=light), seen, found, model, imaging)
 
 
 def unsure_bead(n=10):
     sigma = np.where(np.arange(n) == 3, 1.0, 0.1)
     beads = Fake(uv=np.zeros((n, 2)), sigma=sigma, overlapped=np.zeros(n, bool))
-    measured = extraction._Measured(np.arange(n), beads, [None] * n, np.zeros((n, 2)), np.zeros(n))
-    return extraction._checked(None, None, None, measured, None).refused[0].finding
+    measured = extraction._Measured(
+        np.arange(n),
+        beads,
+        [None] * n,
+        radius_px=np.ones(n),
+        imaging=None,
+        predicted=Fake(view=None, uv=np.zeros((n, 2)), sd_px=np.zeros(n)),
+    )
+    return extraction._checked(None, None, measured).refused[0].finding
 
 
 def drift(source, confirmed, level=ERROR):

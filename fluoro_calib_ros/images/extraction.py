@@ -22,8 +22,9 @@ from .growth import Match, Seen, nearby_residuals, supported
 from .imaging import Expected, Imaging, first_imaging
 from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, measure_beads
+from .profile import Profile
 from .shadow_fit import MAX_SIGMA_PX, Beads
-from .view import Lens, View, fit_view
+from .view import TAIL, Lens, View, fit_view
 
 # Accepted share of wrong centres among those with the largest standard deviation. A centre is
 # wrong if it is off by half a pixel; distances have Rayleigh's distribution.
@@ -37,6 +38,12 @@ RADII = (0.2, 5.0)  # radii of shadows of equal beads, relative to a typical one
 MIN_CONTRASTS = 20  # least number of beads from which the usual depth is estimated
 CONTRAST_STEPS = 8
 MIN_USUAL_DEPTH = 0.1
+BLACK_ROUNDS = 4  # largest number of estimates of the grey value of no light
+# Least change of that grey value, and its largest distance below 0, over the usual light: smaller
+# changes and longer distances change slopes of the light within shadows by about 10 % at most.
+MIN_BLACK = 0.1
+MAX_BLACK = 2.0
+SURE_SDS = 3.0
 RESIDUAL_SIGMAS = 4.5  # largest residual from the prediction by neighbours [standard deviations]
 FIRST_RESIDUAL_PX = 2.5
 ALONE_RADII = 2.5  # least distance of an isolated bead from the next shadow [radii]
@@ -108,7 +115,8 @@ class Nearby:
     def look(self) -> Look:
         """Expected appearance of beads."""
         # For bright beads the noise was estimated on the inverted image: estimate it again.
-        noise = None if self.inverted else self.imaging.noise
+        imaging = self.imaging
+        noise = None if self.inverted else imaging.noise.above(-imaging.black)
         return Look(self.radius_px, self.inverted, noise, alike=self.imaging.sizes_are_alike)
 
 
@@ -158,9 +166,7 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
         found = follow(seen, model, near.view, near.scale_px, near.far)
         if found is None:
             return None
-        followed = _measured(
-            detections, seen, matched=found, model=model, imaging=near.imaging, passes=(STEPS,)
-        )
+        followed = _measured(detections, seen, matched=found, model=model, imaging=near.imaging)
     except DataError:
         return None
     return replace(followed, followed=True)
@@ -175,79 +181,24 @@ def _seen(detections: Detections, model: PhantomModel) -> Seen:
     )
 
 
-def _measured(
-    detections: Detections,
-    seen: Seen,
-    matched: Match,
-    model: PhantomModel,
-    imaging: Imaging | None = None,
-    passes: tuple[int, ...] = (FIRST_STEPS, STEPS),
-) -> Extraction:
-    """Measure all predicted beads, by default twice: the second time from a better prediction."""
-    view = matched.view
-    predicted = matched.predicted
-    bead = matched.bead
-    uv = seen.uv[matched.detection]
-    light = detections.light
-    for steps in passes:
-        rows = np.flatnonzero(seen.in_field(predicted))
-        outlines = view.outlines(model.xyz)
-        shadows = _expected(predicted, rows, bead, uv, seen=seen, outlines=outlines)
-        if imaging is None:
-            told = _relative_sizes(model)
-            imaging = first_imaging(light, detections.noise, shadows, seen.radius_px, size=told)
-        imaging = imaging.completed(light, shadows)
-        sized = np.isfinite(imaging.size[rows])
-        size = np.where(sized, imaging.size[rows], 1.0)
-        beads = measure_beads(
-            light,
-            uv=shadows.uv,
-            shape=shadows.shape,
-            size=size,
-            profile=imaging.profile,
-            noise=imaging.noise,
-            steps=steps,
-        )
-        reasons = _reasons(beads, predicted[rows])
-        reasons = [reason if known else HIDDEN for reason, known in zip(reasons, sized)]
-        good = np.array([reason is None for reason in reasons], dtype=bool)
-        if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(matched.bead)):
-            measured_well = int(np.count_nonzero(good))
-            raise DataError(
-                f'the phantom is found with {len(matched.bead)} beads, of which only '
-                f'{measured_well} can be measured',
-                kind=Kind.BEADS_NOT_MEASURED,
-                numbers={'beads': len(matched.bead), 'measured': measured_well},
-            )
-        bead = rows[good]
-        uv = beads.uv[good]
-        view, _ = fit_view(view, model.xyz[bead], uv, 3)
-        nearby = nearby_residuals(view, model.xyz, bead, uv)
-        predicted = view.project(model.xyz) + nearby.value
-    measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
-    away = _away(measured)
-    if away.any():
-        # Misplaced beads have biased the predictions of their neighbours: predict without them.
-        kept = good & ~away
-        nearby = nearby_residuals(view, model.xyz, rows[kept], beads.uv[kept])
-        predicted = view.project(model.xyz) + nearby.value
-        measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
-    assert imaging is not None
-    extraction = _checked(detections, matched, view, measured, imaging)
-    extraction = _with_support(extraction, model, rows)
-    # The fit measures the centres of shadows; observations are the projected centres of beads.
-    radius_px = imaging.profile.border_px * (shadows.radius * size)
-    of_bead = radius_px[np.searchsorted(rows, extraction.bead)]
-    xyz = model.xyz[extraction.bead]
-    shift = view.shadow_shift(xyz, of_bead)
-    bent = shift - view.with_degree(1).shadow_shift(xyz, of_bead)
-    bent_px = np.sqrt(np.sum(bent**2, axis=1) / 2)
-    return replace(
-        extraction,
-        uv=extraction.uv - shift,
-        sigma=np.hypot(extraction.sigma, BENT_LEFT * bent_px),
-        bent_px=float(np.sqrt(np.mean(bent_px**2))),
-    )
+@dataclass(frozen=True)
+class _Predicted:
+    """Beads that were found, and the prediction of all beads from them."""
+
+    view: View
+    bead: NDArray[np.int64]  #: (m,), rows of the beads found
+    found: NDArray[np.float64]  #: (m, 2), their centres [px]
+    uv: NDArray[np.float64]  #: (n, 2), predicted pixels of all beads of the phantom
+    #: (n,), standard deviation of a coordinate from its prediction, including survey errors
+    sd_px: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, view: View, model: PhantomModel, bead: NDArray[np.int64], found: NDArray[np.float64]
+    ) -> _Predicted:
+        """Return the prediction of a view and of neighbours that were found."""
+        nearby = nearby_residuals(view, model.xyz, bead, found)
+        return cls(view, bead, found, view.project(model.xyz) + nearby.value, nearby.sd_px)
 
 
 @dataclass(frozen=True)
@@ -257,21 +208,167 @@ class _Measured:
     rows: NDArray[np.int64]  #: (n,), rows of the phantom
     beads: Beads
     reasons: list[Finding | None]  #: (n,), reasons against an observation, or None
-    predicted: NDArray[np.float64]  #: (m, 2), predicted pixels of all beads of the phantom
-    #: (n,), standard deviation of a coordinate from its prediction, including survey errors
-    sd_px: NDArray[np.float64]
+    radius_px: NDArray[np.float64]  #: (n,), radii of the pixels that determine the centres
+    imaging: Imaging
+    predicted: _Predicted  #: the prediction from these measurements
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """Whether nothing speaks against an observation (n,)."""
+        return np.array([reason is None for reason in self.reasons], dtype=bool)
 
     @property
     def residual(self) -> NDArray[np.float64]:
         """Distances (n,) from the predictions by neighbours [px]."""
-        return np.linalg.norm(self.beads.uv - self.predicted[self.rows], axis=1)
+        return np.linalg.norm(self.beads.uv - self.predicted.uv[self.rows], axis=1)
+
+
+def _measured(
+    detections: Detections,
+    seen: Seen,
+    matched: Match,
+    model: PhantomModel,
+    imaging: Imaging | None = None,
+) -> Extraction:
+    """Measure all predicted beads; without a known imaging twice, from a better prediction."""
+    sd_px = np.full(len(model.xyz), np.inf)
+    found = seen.uv[matched.detection]
+    predicted = _Predicted(matched.view, matched.bead, found, matched.predicted, sd_px)
+    if imaging is None:
+        first = _first_measured(detections, seen, predicted, model)
+        predicted, imaging = first.predicted, first.imaging
+    measured = _measured_once(
+        detections, seen, predicted, model=model, imaging=imaging, least=len(matched.bead)
+    )
+    away = _away(measured)
+    if away.any():
+        # Misplaced beads have biased the predictions of their neighbours: predict without them.
+        kept = measured.good & ~away
+        view = measured.predicted.view
+        without = _Predicted.of(view, model, measured.rows[kept], measured.beads.uv[kept])
+        measured = replace(measured, predicted=without)
+    extraction = _checked(detections, matched, measured)
+    return _of_centres(_with_support(extraction, model, measured.rows), measured, model)
+
+
+def _first_measured(
+    detections: Detections, seen: Seen, predicted: _Predicted, model: PhantomModel
+) -> _Measured:
+    """Measure all predicted beads in light above a grey value that their contrasts determine."""
+    black = 0.0
+    start: Profile | None = None
+    for _ in range(BLACK_ROUNDS):
+        imaging = _first_imaging(
+            detections, seen, predicted, model=model, black=black, start=start
+        )
+        measured = _measured_once(
+            detections,
+            seen,
+            predicted,
+            model=model,
+            imaging=imaging,
+            least=len(predicted.bead),
+            steps=FIRST_STEPS,
+        )
+        before, black = black, _black_level(measured.beads, black)
+        if black == before:
+            break
+        light = float(np.median(measured.beads.light))
+        start = imaging.profile.in_light(1 - (black - before) / light)
+    return measured
+
+
+def _first_imaging(
+    detections: Detections,
+    seen: Seen,
+    predicted: _Predicted,
+    model: PhantomModel,
+    black: float,
+    start: Profile | None,
+) -> Imaging:
+    """Estimate how beads look in the light above a grey value."""
+    light = detections.light.above(black)
+    noise = detections.noise.above(black)
+    shadows = _expected(predicted, seen, model)
+    told = _relative_sizes(model)
+    imaging = first_imaging(light, noise, shadows, seen.radius_px, size=told, start=start)
+    return replace(imaging, black=black)
+
+
+def _measured_once(
+    detections: Detections,
+    seen: Seen,
+    predicted: _Predicted,
+    model: PhantomModel,
+    imaging: Imaging,
+    least: int,
+    steps: int = STEPS,
+) -> _Measured:
+    """Measure all predicted beads.
+
+    least: number of matched beads, of which MIN_ACCEPTED have to be measured well. Raises
+    DataError.
+    """
+    shadows = _expected(predicted, seen, model)
+    light = detections.light.above(imaging.black)
+    imaging = imaging.completed(light, shadows)
+    sized = np.isfinite(imaging.size[shadows.row])
+    size = np.where(sized, imaging.size[shadows.row], 1.0)
+    beads = measure_beads(
+        light,
+        uv=shadows.uv,
+        shape=shadows.shape,
+        size=size,
+        profile=imaging.profile,
+        noise=imaging.noise,
+        steps=steps,
+    )
+    reasons = _reasons(beads, predicted.uv[shadows.row])
+    reasons = [reason if known else HIDDEN for reason, known in zip(reasons, sized)]
+    good = np.array([reason is None for reason in reasons], dtype=bool)
+    if np.count_nonzero(good) < max(4, MIN_ACCEPTED * least):
+        measured_well = int(np.count_nonzero(good))
+        raise DataError(
+            f'the phantom is found with {least} beads, of which only {measured_well} can be '
+            'measured',
+            kind=Kind.BEADS_NOT_MEASURED,
+            numbers={'beads': least, 'measured': measured_well},
+        )
+    bead = shadows.row[good]
+    view, _ = fit_view(predicted.view, model.xyz[bead], beads.uv[good], 3)
+    predicted = _Predicted.of(view, model, bead, beads.uv[good])
+    radius_px = imaging.profile.border_px * (shadows.radius * size)
+    return _Measured(
+        shadows.row,
+        beads,
+        reasons,
+        radius_px=radius_px,
+        imaging=imaging,
+        predicted=predicted,
+    )
+
+
+def _of_centres(extraction: Extraction, measured: _Measured, model: PhantomModel) -> Extraction:
+    """Return observations of the projected centres of beads: the fit measures those of shadows."""
+    view = measured.predicted.view
+    radius_px = measured.radius_px[np.searchsorted(measured.rows, extraction.bead)]
+    xyz = model.xyz[extraction.bead]
+    shift = view.shadow_shift(xyz, radius_px)
+    bent = shift - view.with_degree(1).shadow_shift(xyz, radius_px)
+    bent_px = np.sqrt(np.sum(bent**2, axis=1) / 2)
+    return replace(
+        extraction,
+        uv=extraction.uv - shift,
+        sigma=np.hypot(extraction.sigma, BENT_LEFT * bent_px),
+        bent_px=float(np.sqrt(np.mean(bent_px**2))),
+    )
 
 
 def _away(measured: _Measured) -> NDArray[np.bool_]:
     """Return (n,) whether well-measured beads are off the places predicted by their neighbours."""
-    good = np.array([reason is None for reason in measured.reasons], dtype=bool)
+    good = measured.good
     sigma = measured.beads.sigma[good]
-    scatter = np.maximum(measured.sd_px[good], MIN_SCATTER_PX)
+    scatter = np.maximum(measured.predicted.sd_px[measured.rows[good]], MIN_SCATTER_PX)
     residual = measured.residual[good]
     near = residual < RESIDUAL_SIGMAS * np.hypot(scatter, sigma)
     away = np.zeros(len(good), dtype=bool)
@@ -279,13 +376,7 @@ def _away(measured: _Measured) -> NDArray[np.bool_]:
     return away
 
 
-def _checked(
-    detections: Detections,
-    matched: Match,
-    view: View,
-    measured: _Measured,
-    imaging: Imaging,
-) -> Extraction:
+def _checked(detections: Detections, matched: Match, measured: _Measured) -> Extraction:
     """Exclude beads that are off the places predicted by their neighbours, or measured badly."""
     beads = measured.beads
     reasons = list(measured.reasons)
@@ -304,7 +395,7 @@ def _checked(
     good &= ~vague
     refused = tuple(
         Refusal(int(row), uv, reason)
-        for row, uv, reason in zip(measured.rows, measured.predicted[measured.rows], reasons)
+        for row, uv, reason in zip(measured.rows, measured.predicted.uv[measured.rows], reasons)
         if reason is not None
     )
     return Extraction(
@@ -313,10 +404,10 @@ def _checked(
         sigma=beads.sigma[good],
         overlapped=beads.overlapped[good],
         refused=refused,
-        view=view,
+        view=measured.predicted.view,
         detections=detections,
         match=matched,
-        imaging=imaging,
+        imaging=measured.imaging,
     )
 
 
@@ -365,21 +456,17 @@ def _with_support(
     )
 
 
-def _expected(
-    predicted: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    bead: NDArray[np.int64],
-    uv: NDArray[np.float64],
-    seen: Seen,
-    outlines: NDArray[np.float64],
-) -> Expected:
+def _expected(predicted: _Predicted, seen: Seen, model: PhantomModel) -> Expected:
     """Return expected shadows: at the detection of an isolated bead, else at the prediction."""
-    start = predicted.copy()
-    apart = np.full(len(predicted), np.inf)
+    rows = np.flatnonzero(seen.in_field(predicted.uv))
+    start = predicted.uv.copy()
+    apart = np.full(len(start), np.inf)
     if len(rows) > 1:
-        apart[rows] = cKDTree(predicted[rows]).query(predicted[rows], k=[2])[0][:, 0]
+        apart[rows] = cKDTree(start[rows]).query(start[rows], k=[2])[0][:, 0]
     alone = apart > ALONE_RADII * seen.radius_px
-    start[bead[alone[bead]]] = uv[alone[bead]]
+    bead = predicted.bead
+    start[bead[alone[bead]]] = predicted.found[alone[bead]]
+    outlines = predicted.view.outlines(model.xyz)
     size = np.sqrt(np.abs(np.linalg.det(outlines)))
     typical = float(np.median(size))
     usable = (size > RADII[0] * typical) & (size < RADII[1] * typical)
@@ -394,27 +481,74 @@ def _relative_sizes(model: PhantomModel) -> NDArray[np.float64]:
     return np.asarray(model.diameter_mm / np.median(model.diameter_mm))
 
 
+@dataclass(frozen=True)
+class _Contrasts:
+    """Contrasts of beads over the light around them: slope * light + offset."""
+
+    slope: float
+    offset: float  #: over the median light
+    light: float  #: median light
+    sd: float  #: standard deviation of slope and offset
+
+    @classmethod
+    def of(cls, beads: Beads, good: NDArray[np.bool_]) -> _Contrasts | None:
+        """Fit the line to good beads (n,); return None if they are too few.
+
+        The line is fitted by iteratively reweighted least squares with Cauchy weights. The
+        standard deviation allows for contrasts that vary as slowly as the light, such as those of
+        beads that lie deeper in the phantom.
+        """
+        if np.count_nonzero(good) < MIN_CONTRASTS:
+            return None
+        median = float(np.median(beads.light[good]))
+        light = beads.light[good] / median
+        rows = np.column_stack([light, np.ones_like(light)])
+        contrast = beads.depth[good] * light
+        line = np.array([float(np.median(beads.depth[good])), 0.0])
+        for _ in range(CONTRAST_STEPS):
+            residual = contrast - rows @ line
+            scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+            weight = 1 / np.sqrt(1 + (residual / scale) ** 2)
+            line = np.linalg.lstsq(rows * weight[:, None], contrast * weight, rcond=None)[0]
+        residual = np.clip(contrast - rows @ line, -TAIL * scale, TAIL * scale)
+        _, nearest = cKDTree(beads.uv[good]).query(beads.uv[good], k=[2])
+        slow = max(float(np.mean(residual * residual[nearest[:, 0]])), 0.0)
+        variance = slow + scale**2 / np.sqrt(len(light))
+        spread = max(float(np.std(light)), np.finfo(float).tiny)
+        return cls(float(line[0]), float(line[1]), median, float(np.sqrt(variance)) / spread)
+
+
+def _black_level(beads: Beads, black: float) -> float:
+    """Return the grey value at which beads would have no contrast.
+
+    Beads absorb a share of the light, so that their contrast is proportional to it. If the grey
+    values were windowed for display, it is proportional to their difference from another one; in
+    a logarithmic image, it is the same everywhere. black: the grey value above which the light is
+    measured; it stays, if it is likely.
+    """
+    good = beads.measured & (beads.light > 0) & (beads.misfit < MAX_MISFIT)
+    line = _Contrasts.of(beads, good)
+    if line is None or line.slope < -SURE_SDS * line.sd or abs(line.offset) < SURE_SDS * line.sd:
+        return black
+    change = -line.offset / max(line.slope, abs(line.offset) / MAX_BLACK) * line.light
+    grey = line.light + black
+    level = max(black + change, -MAX_BLACK * grey)
+    return level if abs(level - black) > MIN_BLACK * line.light else black
+
+
 def _usual_depth(beads: Beads) -> NDArray[np.float64]:
     """Return the usual depths (n,) of shadows at the places of the beads.
 
     Beads absorb the same share of the direct light, and no scattered light; a hole of a sheet adds
     a share of the light behind the sheet. A contrast is therefore linear in the light around the
-    bead. The line is fitted by iteratively reweighted least squares with Cauchy weights.
+    bead.
     """
     good = beads.measured & (beads.light > 0)
     usual = np.ones(len(beads.uv))
-    if np.count_nonzero(good) < MIN_CONTRASTS:
-        return usual
-    light = beads.light / float(np.median(beads.light[good]))
-    rows = np.column_stack([light, np.ones_like(light)])[good]
-    contrast = (beads.depth * light)[good]
-    line = np.array([float(np.median(beads.depth[good])), 0.0])
-    for _ in range(CONTRAST_STEPS):
-        residual = contrast - rows @ line
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
-        weight = 1 / np.sqrt(1 + (residual / scale) ** 2)
-        line = np.linalg.lstsq(rows * weight[:, None], contrast * weight, rcond=None)[0]
-    usual[good] = np.maximum(line[0] + line[1] / light[good], MIN_USUAL_DEPTH)
+    line = _Contrasts.of(beads, good)
+    if line is not None:
+        offset = line.offset / (beads.light[good] / line.light)
+        usual[good] = np.maximum(line.slope + offset, MIN_USUAL_DEPTH)
     return usual
 
 

@@ -268,7 +268,7 @@ def _outlined(
     outline = cv2.convexHull(np.rint(predicted).astype(np.int32))
     inside = cv2.fillConvexPoly(np.zeros(shape, dtype=np.uint8), outline, 1)
     column, row = np.rint(uv).astype(int).T
-    return inside[row, column].astype(bool), np.count_nonzero(inside)
+    return inside[row, column].astype(bool), int(np.count_nonzero(inside))
 
 
 def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -159,6 +159,7 @@ class Imaging:
     profile: Profile  #: shadow of a typical bead
     #: (n,), relative size of each bead of the phantom; 1 is typical, NaN is unknown
     size: NDArray[np.float64]
+    black: float = 0.0  #: grey value of no light; the noise is that of the light above it
 
     @property
     def sizes_are_alike(self) -> bool:
@@ -181,13 +182,14 @@ def first_imaging(
     shadows: Expected,
     radius_px: float,
     size: NDArray[np.float64],
+    start: Profile | None = None,
 ) -> Imaging:
     """Estimate the shadows and sizes of beads from an image.
 
     radius_px: initial value of the radius of a typical bead. size: (n,) relative sizes of all
-    beads of the phantom, NaN if unspecified.
+    beads of the phantom, NaN if unspecified. start: initial profile.
     """
-    profile = _typical(light, shadows, size, radius_px)
+    profile = _typical(light, shadows, size, radius_px, start=start)
     imaging = Imaging(noise, profile, size)
     if not np.isfinite(size).all():
         imaging = _with_sizes(light, shadows, imaging)

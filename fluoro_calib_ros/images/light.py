@@ -15,7 +15,7 @@ normal equations, so standard deviations include the uncertainty of the backgrou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -53,6 +53,13 @@ class Light:
     grey: NDArray[np.float32]  #: (h, w)
     field: NDArray[np.bool_]  #: (h, w), the field of view
     clipping: Clipping = UNCLIPPED
+
+    def above(self, black: float) -> Light:
+        """Return the light over a grey value that stands for no light."""
+        if not black:
+            return self
+        clipping = Clipping(self.clipping.low - black, self.clipping.high - black)
+        return Light(self.grey - np.float32(black), self.field, clipping)
 
     def around(self, uv: NDArray[np.float64]) -> NDArray[np.floating]:
         """Return the mean light (n,) in the surroundings of pixels (n, 2)."""
@@ -104,6 +111,10 @@ class Noise:
     def variance(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return the variance of grey values, given their expected light."""
         return np.maximum(self.constant + self.gain * np.maximum(light, 0), MIN_VARIANCE)
+
+    def above(self, black: float) -> Noise:
+        """Return the noise of the light over a grey value that stands for no light."""
+        return replace(self, constant=self.constant + self.gain * black)
 
 
 def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noise:

@@ -115,6 +115,12 @@ class Profile:
         direct = min(absorbed / (1 - scatter), MAX_ABSORBED)
         return replace(self, attenuation=float(-0.5 * np.log1p(-direct)), scatter=scatter)
 
+    def in_light(self, factor: float) -> Profile:
+        """Return the profile of an equally dark shadow if there is more light by a factor."""
+        absorbed = (1 - self.scatter) * -np.expm1(-2 * self.attenuation) / factor
+        direct = min(absorbed, MAX_ABSORBED)
+        return replace(self, attenuation=float(-0.5 * np.log1p(-direct)), scatter=0.0)
+
     def absorbed(
         self, squared: NDArray[np.float64], size: NDArray[np.float64] | float = 1.0
     ) -> NDArray[np.float64]:

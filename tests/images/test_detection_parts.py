@@ -3,6 +3,7 @@
 
 """Parts of the detection of beads: noise of responses, places in reduced images, large beads."""
 
+from dataclasses import replace
 from types import SimpleNamespace as Fake
 
 import cv2
@@ -13,6 +14,7 @@ from scipy.signal import convolve2d
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images import detection, extraction
+from fluoro_calib_ros.images.clipping import Clipping
 from fluoro_calib_ros.images.detection import (
     _background,
     _Blobs,
@@ -24,9 +26,10 @@ from fluoro_calib_ros.images.detection import (
     _typical,
     vertex,
 )
-from fluoro_calib_ros.images.light import LAGS, Noise
+from fluoro_calib_ros.images.light import LAGS, Light, Noise
 from fluoro_calib_ros.images.marker_intensity import check_image
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerTracker
+from fluoro_calib_ros.images.profile import Profile
 
 RNG = np.random.default_rng(51)
 WHITE = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
@@ -180,6 +183,59 @@ def test_usual_depth_is_linear_in_the_light_without_the_odd_ones():
     assert found[[50, 51]].tolist() == [1, 1]
     few = Fake(**{k: v[:3] for k, v in vars(beads).items()})
     assert extraction._usual_depth(few).tolist() == [1, 1, 1]
+
+
+def contrasting(black, light, noise=0.0):
+    """Return beads in light over `black`, which absorb 80 % of it, with errors of contrasts."""
+    n = len(light)
+    error = np.zeros(n) + noise
+    depth = (0.8 * (light - black) + error * np.median(light)) / light
+    uv = np.stack(np.meshgrid(np.arange(8.0), np.arange(n // 8)), -1).reshape(-1, 2)
+    return Fake(uv=uv, light=light, depth=depth, measured=np.ones(n, bool), misfit=np.ones(n))
+
+
+@pytest.mark.parametrize('black', [-60.0, 30.0])
+def test_contrasts_tell_the_grey_value_of_no_light(black):
+    light = np.linspace(60.0, 180.0, 64)
+    random = RNG.normal(0, 0.01, 64)
+    assert extraction._black_level(contrasting(black, light, random), 0.0) == pytest.approx(
+        black, abs=8
+    )
+    # It stays where contrasts scatter more, as slowly as the light, or hardly tell it.
+    assert extraction._black_level(contrasting(black, light, 20 * random), 0.0) == 0.0
+    slow = 0.1 * np.sin(np.arange(64) / 8)
+    assert extraction._black_level(contrasting(0.0, light, slow), 0.0) == 0.0
+    assert extraction._black_level(contrasting(-5.0, light, random), 0.0) == 0.0
+    assert extraction._black_level(contrasting(0.0, 150 + 0.01 * light, random), 7.0) == 7.0
+    few = Fake(**{name: value[:16] for name, value in vars(contrasting(-60.0, light)).items()})
+    assert extraction._black_level(few, 0.0) == 0.0
+
+
+def test_grey_value_of_no_light_is_at_most_twice_the_light_below_zero():
+    """The contrast of a logarithmic image is the same everywhere."""
+    light = np.linspace(60.0, 180.0, 64)
+    same = contrasting(0.0, light)
+    same.depth = 40.0 / light
+    assert extraction._black_level(same, 0.0) == pytest.approx(-240)
+    # Light above -240, whose median is 360; the contrasts are still the same.
+    same.light = light + 240
+    same.depth = 40.0 / same.light
+    assert extraction._black_level(same, -240.0) == -240
+
+
+def test_light_over_a_grey_value_has_the_same_noise_and_the_same_shadow():
+    noise = Noise(4.0, 0.5, np.ones((1, 1)))
+    grey = np.array([[20.0, 80.0, 255.0]], dtype=np.float32)
+    light = Light(grey, np.ones((1, 3), bool), Clipping(20.0, 255.0))
+    above = light.above(-50.0)
+    assert above.grey.tolist() == [[70, 130, 305]]
+    assert (above.clipping.low, above.clipping.high) == (70, 305)
+    assert light.above(0.0) is light
+    np.testing.assert_allclose(noise.above(-50.0).variance(above.grey), noise.variance(grey))
+    profile = Profile(6.0, 1.2, 0.9, 0.1)
+    wide = replace(profile, blur_px=0.01), profile.in_light(1.5)
+    middle = [one.absorbed(np.zeros(1))[0] for one in wide]
+    assert middle[1] == pytest.approx(0.9 * middle[0] / 1.5)
 
 
 def found_with(bead, refused=()):

@@ -105,6 +105,22 @@ def test_beads_of_one_size_are_found_without_a_search_for_larger_ones():
     assert np.mean(away < 2) > 0.9  # the others are clutter
 
 
+@pytest.mark.long
+def test_centres_in_a_windowed_image_are_as_precise_as_their_sigma_says():
+    image, true, _ = radiograph()
+    windowed = np.clip(np.rint((image.astype(float) - 70) * 1.6), 0, 255).astype(np.uint8)
+    found = extract_beads(windowed, model(), LENS)
+    assert found.imaging.black == pytest.approx(-70 * 1.6, rel=0.2)
+    error = found.uv - true[found.bead]
+    off = np.abs(error) / found.sigma[:, None]
+    assert np.sqrt(np.mean(off**2)) < 1.15
+    assert (off > 5).sum() <= 2
+    again = extract_beads(windowed, model(), LENS, found.nearby)
+    assert again.followed and again.imaging.black == found.imaging.black
+    shared = np.isin(again.bead, found.bead)
+    assert shared.mean() > 0.99
+
+
 def test_each_refused_bead_has_a_reason():
     found = extraction()
     assert found.refused

@@ -184,6 +184,20 @@ def test_bead_is_refused_at_its_limits(monkeypatch, name, good, bad, kind):
     assert found[2].numbers['off_px'] == pytest.approx(limit + 0.01)
 
 
+def checked(uv, sigma, predicted, sd_px):
+    """Return the extraction from beads at uv (n, 2) with predictions (n, 2)."""
+    n = len(uv)
+    measured = extraction._Measured(
+        np.arange(n),
+        Fake(uv=uv, sigma=sigma, overlapped=np.zeros(n, bool)),
+        [None] * n,
+        radius_px=np.ones(n),
+        imaging='imaging',
+        predicted=Fake(view=None, uv=predicted, sd_px=sd_px),
+    )
+    return extraction._checked(None, None, measured)
+
+
 def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others():
     n = 12
     off = np.full(n, 0.1)
@@ -192,14 +206,8 @@ def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others(
     sigma[7] = 1.01 * extraction.MAX_SIGMAS * 0.06
     sigma[8] = 0.99 * extraction.MAX_SIGMAS * 0.06
     predicted = np.arange(2.0 * n).reshape(n, 2)
-    one = Fake(uv=predicted + np.outer(off, [0.6, 0.8]), sigma=sigma, overlapped=np.zeros(n, bool))
     sd_px = np.linspace(0.06, 0.1, n)
-
-    def checked():
-        measured = extraction._Measured(np.arange(n), one, [None] * n, predicted, sd_px)
-        return extraction._checked(None, None, None, measured, 'imaging')
-
-    found = checked()
+    found = checked(predicted + np.outer(off, [0.6, 0.8]), sigma, predicted, sd_px)
     assert found.bead.tolist() == [k for k in range(n) if k not in (3, 7)]
     assert [refusal.bead for refusal in found.refused] == [3, 7]
     kinds = [refusal.finding.kind for refusal in found.refused]
@@ -208,8 +216,8 @@ def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others(
     limit = extraction.RESIDUAL_SIGMAS * np.hypot(sd_px[3], 0.06)
     for part, is_kept in ((0.98, True), (1.02, False)):
         off[3] = part * limit
-        one.uv = predicted + np.outer(off, [0.6, 0.8])
-        assert (3 in checked().bead) is is_kept
+        found = checked(predicted + np.outer(off, [0.6, 0.8]), sigma, predicted, sd_px)
+        assert (3 in found.bead) is is_kept
 
 
 @pytest.mark.long
@@ -240,23 +248,25 @@ def test_bead_that_is_likely_half_a_pixel_off_is_not_observed(scatter, is_kept):
     uv[4, 0] += 0.5
     sigma = np.full(n, 0.05)
     sigma[4] = 0.12
-    beads = Fake(uv=uv, sigma=sigma, overlapped=np.zeros(n, bool))
-    measured = extraction._Measured(
-        np.arange(n), beads, [None] * n, predicted, np.full(n, scatter)
-    )
     # The residual is within the limit of its own standard deviation.
     assert extraction.RESIDUAL_SIGMAS * np.hypot(0.05, 0.12) > 0.5
-    found = extraction._checked(None, None, None, measured, 'imaging')
+    found = checked(uv, sigma, predicted, np.full(n, scatter))
     assert (4 in found.bead) is is_kept and len(found.bead) == n - 1 + is_kept
 
 
 def test_beads_of_a_line_start_where_they_were_found_alone():
     predicted = np.array([[0.0, 0], [30, 0], [33, 0], [80, 0], [200, 0]])
-    rows = np.arange(4)
-    bead = np.array([0, 1, 3])
-    uv = np.array([[1.0, 1], [31, 1], [81, 1]])
     outlines = circles(np.array([9.0, 4.5, 4.5, 2.25, 0]))
-    found = extraction._expected(predicted, rows, bead, uv, Fake(radius_px=2.0), outlines)
+    found = extraction._expected(
+        Fake(
+            view=Fake(outlines=lambda xyz: outlines),
+            bead=np.array([0, 1, 3]),
+            found=np.array([[1.0, 1], [31, 1], [81, 1]]),
+            uv=predicted,
+        ),
+        Fake(radius_px=2.0, in_field=lambda uv: uv[:, 0] < 100),
+        Fake(xyz=None),
+    )
     assert found.uv.tolist() == [[1, 1], [30, 0], [33, 0], [81, 1]]
     assert found.seen.tolist() == [True, True, False, True]
     assert found.alone.tolist() == [True, False, False, True]

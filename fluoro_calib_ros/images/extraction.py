@@ -16,6 +16,7 @@ from threadpoolctl import ThreadpoolController
 
 from ..errors import DataError
 from ..findings import Finding, Kind
+from .contrasts import black_level, usual_depth
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
 from .growth import Match, Seen, nearby_residuals, supported
@@ -24,7 +25,7 @@ from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, measure_beads
 from .profile import Profile
 from .shadow_fit import MAX_SIGMA_PX, Beads
-from .view import TAIL, Lens, View, fit_view
+from .view import Lens, View, fit_view
 
 # Accepted share of wrong centres among those with the largest standard deviation. A centre is
 # wrong if it is off by half a pixel; distances have Rayleigh's distribution.
@@ -35,15 +36,7 @@ MAX_SIGMAS = 2.9  # largest standard deviation over the usual one: an eighth of 
 MAX_MISFIT = 5.0  # largest lack of fit, relative to that of a typical bead
 DEPTH = (0.55, 1.7)  # depth of a shadow relative to the usual depth in such light
 RADII = (0.2, 5.0)  # radii of shadows of equal beads, relative to a typical one
-MIN_CONTRASTS = 20  # least number of beads from which the usual depth is estimated
-CONTRAST_STEPS = 8
-MIN_USUAL_DEPTH = 0.1
 BLACK_ROUNDS = 4  # largest number of estimates of the grey value of no light
-# Least change of that grey value, and its largest distance below 0, over the usual light: smaller
-# changes and longer distances change slopes of the light within shadows by about 10 % at most.
-MIN_BLACK = 0.1
-MAX_BLACK = 2.0
-SURE_SDS = 3.0
 RESIDUAL_SIGMAS = 4.5  # largest residual from the prediction by neighbours [standard deviations]
 FIRST_RESIDUAL_PX = 2.5
 ALONE_RADII = 2.5  # least distance of an isolated bead from the next shadow [radii]
@@ -270,7 +263,7 @@ def _first_measured(
             least=len(predicted.bead),
             steps=FIRST_STEPS,
         )
-        before, black = black, _black_level(measured.beads, black)
+        before, black = black, black_level(measured.beads, black)
         if black == before:
             break
         light = float(np.median(measured.beads.light))
@@ -481,84 +474,13 @@ def _relative_sizes(model: PhantomModel) -> NDArray[np.float64]:
     return np.asarray(model.diameter_mm / np.median(model.diameter_mm))
 
 
-@dataclass(frozen=True)
-class _Contrasts:
-    """Contrasts of beads over the light around them: slope * light + offset."""
-
-    slope: float
-    offset: float  #: over the median light
-    light: float  #: median light
-    sd: float  #: standard deviation of slope and offset
-
-    @classmethod
-    def of(cls, beads: Beads, good: NDArray[np.bool_]) -> _Contrasts | None:
-        """Fit the line to good beads (n,); return None if they are too few.
-
-        The line is fitted by iteratively reweighted least squares with Cauchy weights. The
-        standard deviation allows for contrasts that vary as slowly as the light, such as those of
-        beads that lie deeper in the phantom.
-        """
-        if np.count_nonzero(good) < MIN_CONTRASTS:
-            return None
-        median = float(np.median(beads.light[good]))
-        light = beads.light[good] / median
-        rows = np.column_stack([light, np.ones_like(light)])
-        contrast = beads.depth[good] * light
-        line = np.array([float(np.median(beads.depth[good])), 0.0])
-        for _ in range(CONTRAST_STEPS):
-            residual = contrast - rows @ line
-            scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
-            weight = 1 / np.sqrt(1 + (residual / scale) ** 2)
-            line = np.linalg.lstsq(rows * weight[:, None], contrast * weight, rcond=None)[0]
-        residual = np.clip(contrast - rows @ line, -TAIL * scale, TAIL * scale)
-        _, nearest = cKDTree(beads.uv[good]).query(beads.uv[good], k=[2])
-        slow = max(float(np.mean(residual * residual[nearest[:, 0]])), 0.0)
-        variance = slow + scale**2 / np.sqrt(len(light))
-        spread = max(float(np.std(light)), np.finfo(float).tiny)
-        return cls(float(line[0]), float(line[1]), median, float(np.sqrt(variance)) / spread)
-
-
-def _black_level(beads: Beads, black: float) -> float:
-    """Return the grey value at which beads would have no contrast.
-
-    Beads absorb a share of the light, so that their contrast is proportional to it. If the grey
-    values were windowed for display, it is proportional to their difference from another one; in
-    a logarithmic image, it is the same everywhere. black: the grey value above which the light is
-    measured; it stays, if it is likely.
-    """
-    good = beads.measured & (beads.light > 0) & (beads.misfit < MAX_MISFIT)
-    line = _Contrasts.of(beads, good)
-    if line is None or line.slope < -SURE_SDS * line.sd or abs(line.offset) < SURE_SDS * line.sd:
-        return black
-    change = -line.offset / max(line.slope, abs(line.offset) / MAX_BLACK) * line.light
-    grey = line.light + black
-    level = max(black + change, -MAX_BLACK * grey)
-    return level if abs(level - black) > MIN_BLACK * line.light else black
-
-
-def _usual_depth(beads: Beads) -> NDArray[np.float64]:
-    """Return the usual depths (n,) of shadows at the places of the beads.
-
-    Beads absorb the same share of the direct light, and no scattered light; a hole of a sheet adds
-    a share of the light behind the sheet. A contrast is therefore linear in the light around the
-    bead.
-    """
-    good = beads.measured & (beads.light > 0)
-    usual = np.ones(len(beads.uv))
-    line = _Contrasts.of(beads, good)
-    if line is not None:
-        offset = line.offset / (beads.light[good] / line.light)
-        usual[good] = np.maximum(line.slope + offset, MIN_USUAL_DEPTH)
-    return usual
-
-
 def _reasons(beads: Beads, predicted: NDArray[np.float64]) -> list[Finding | None]:
     """Return the reasons why beads are not observed, None for observed beads."""
     away = np.linalg.norm(beads.uv - predicted, axis=1)
-    usual_depth = _usual_depth(beads)
+    usual = usual_depth(beads)
     out: list[Finding | None] = []
     for number in range(len(beads.uv)):
-        depth = float(beads.depth[number] / usual_depth[number])
+        depth = float(beads.depth[number] / usual[number])
         off = float(away[number])
         reason: Finding | None = None
         if not beads.measured[number]:

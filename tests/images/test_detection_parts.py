@@ -13,7 +13,7 @@ from scipy.signal import convolve2d
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Finding, Kind
-from fluoro_calib_ros.images import detection, extraction
+from fluoro_calib_ros.images import contrasts, detection, extraction
 from fluoro_calib_ros.images.clipping import Clipping
 from fluoro_calib_ros.images.detection import (
     _background,
@@ -177,12 +177,12 @@ def test_usual_depth_is_linear_in_the_light_without_the_odd_ones():
     measured[50] = False
     light[51] = 0.0
     beads = Fake(uv=np.zeros((60, 2)), light=light, depth=depth, measured=measured)
-    found = extraction._usual_depth(beads)
+    found = contrasts.usual_depth(beads)
     good = np.delete(np.arange(60), [50, 51])
     np.testing.assert_allclose(found[good], 0.8 + 0.15 / relative[good], rtol=0.02)
     assert found[[50, 51]].tolist() == [1, 1]
     few = Fake(**{k: v[:3] for k, v in vars(beads).items()})
-    assert extraction._usual_depth(few).tolist() == [1, 1, 1]
+    assert contrasts.usual_depth(few).tolist() == [1, 1, 1]
 
 
 def contrasting(black, light, noise=0.0):
@@ -198,17 +198,17 @@ def contrasting(black, light, noise=0.0):
 def test_contrasts_tell_the_grey_value_of_no_light(black):
     light = np.linspace(60.0, 180.0, 64)
     random = RNG.normal(0, 0.01, 64)
-    assert extraction._black_level(contrasting(black, light, random), 0.0) == pytest.approx(
+    assert contrasts.black_level(contrasting(black, light, random), 0.0) == pytest.approx(
         black, abs=8
     )
     # It stays where contrasts scatter more, as slowly as the light, or hardly tell it.
-    assert extraction._black_level(contrasting(black, light, 20 * random), 0.0) == 0.0
+    assert contrasts.black_level(contrasting(black, light, 20 * random), 0.0) == 0.0
     slow = 0.1 * np.sin(np.arange(64) / 8)
-    assert extraction._black_level(contrasting(0.0, light, slow), 0.0) == 0.0
-    assert extraction._black_level(contrasting(-5.0, light, random), 0.0) == 0.0
-    assert extraction._black_level(contrasting(0.0, 150 + 0.01 * light, random), 7.0) == 7.0
+    assert contrasts.black_level(contrasting(0.0, light, slow), 0.0) == 0.0
+    assert contrasts.black_level(contrasting(-5.0, light, random), 0.0) == 0.0
+    assert contrasts.black_level(contrasting(0.0, 150 + 0.01 * light, random), 7.0) == 7.0
     few = Fake(**{name: value[:16] for name, value in vars(contrasting(-60.0, light)).items()})
-    assert extraction._black_level(few, 0.0) == 0.0
+    assert contrasts.black_level(few, 0.0) == 0.0
 
 
 def test_grey_value_of_no_light_is_at_most_twice_the_light_below_zero():
@@ -216,11 +216,11 @@ def test_grey_value_of_no_light_is_at_most_twice_the_light_below_zero():
     light = np.linspace(60.0, 180.0, 64)
     same = contrasting(0.0, light)
     same.depth = 40.0 / light
-    assert extraction._black_level(same, 0.0) == pytest.approx(-240)
+    assert contrasts.black_level(same, 0.0) == pytest.approx(-240)
     # Light above -240, whose median is 360; the contrasts are still the same.
     same.light = light + 240
     same.depth = 40.0 / same.light
-    assert extraction._black_level(same, -240.0) == -240
+    assert contrasts.black_level(same, -240.0) == -240
 
 
 def test_light_over_a_grey_value_has_the_same_noise_and_the_same_shadow():

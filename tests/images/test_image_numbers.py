@@ -170,7 +170,7 @@ def beads(**changes):
     ],
 )
 def test_bead_is_refused_at_its_limits(monkeypatch, name, good, bad, kind):
-    monkeypatch.setattr(extraction, '_usual_depth', lambda beads: np.ones(6))
+    monkeypatch.setattr(extraction, 'usual_depth', lambda beads: np.ones(6))
     for value, expected in ((good, None), (bad, kind)):
         one = beads(depth=np.ones(6))
         getattr(one, name)[2] = value

@@ -263,7 +263,9 @@ def _first_measured(
             least=len(predicted.bead),
             steps=FIRST_STEPS,
         )
-        before, black = black, black_level(measured.beads, black)
+        before = black
+        if not (detections.inverted and model.grid is not None):  # holes in a sheet
+            black = black_level(measured.beads, black)
         if black == before:
             break
         light = float(np.median(measured.beads.light))

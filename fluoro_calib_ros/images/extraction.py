@@ -20,7 +20,7 @@ from .contrasts import black_level, usual_depth
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
 from .growth import Match, Seen, nearby_residuals, supported
-from .imaging import Expected, Imaging, first_imaging
+from .imaging import MOST, Expected, Imaging, first_imaging
 from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, measure_beads
 from .profile import Profile
@@ -140,13 +140,34 @@ def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:
         seen = _seen(detections, model)
         try:
             found = match(seen, model, lens)
-            return _measured(detections, seen, found, model)
+            extraction = _measured(detections, seen, found, model)
+            return _detected_anew(image, extraction, model) or extraction
         except DataError as error:
             first = first or error
             if error.finding.kind is Kind.POSE_AMBIGUOUS:
                 break
     assert first is not None
     raise first
+
+
+def _detected_anew(
+    image: np.ndarray, extraction: Extraction, model: PhantomModel
+) -> Extraction | None:
+    """Extract beads again, by their size, if that of the detections is the size of other objects.
+
+    Return None if it is that of the beads, or if no pose is found anew.
+    """
+    found = extraction.detections
+    radius_px = extraction.imaging.profile.radius_px
+    if found.radius_px / MOST < radius_px < found.radius_px * MOST:
+        return None
+    try:
+        detections = detect_beads(image, len(model.xyz), Look(radius_px, found.inverted))
+        seen = _seen(detections, model)
+        matched = follow(seen, model, extraction.view, extraction.match.scale_px)
+        return None if matched is None else _measured(detections, seen, matched, model)
+    except DataError:
+        return None
 
 
 def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extraction | None:

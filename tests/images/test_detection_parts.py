@@ -238,6 +238,37 @@ def test_light_over_a_grey_value_has_the_same_noise_and_the_same_shadow():
     assert middle[1] == pytest.approx(0.9 * middle[0] / 1.5)
 
 
+@pytest.mark.parametrize(
+    ('fitted_px', 'outcome', 'expected'),
+    [(5.1, 'pose', None), (5.3, 'pose', 'anew'), (1.2, 'pose', 'anew'), (5.3, 'none', None),
+     (5.3, 'refused', None)],
+)  # fmt: skip
+def test_beads_are_detected_anew_by_their_fitted_size(monkeypatch, fitted_px, outcome, expected):
+    looks = []
+
+    def detect(image, count, look):
+        looks.append(look)
+        if outcome == 'refused':
+            raise DataError('no beads')
+        return 'detections'
+
+    monkeypatch.setattr(extraction, 'detect_beads', detect)
+    monkeypatch.setattr(extraction, '_seen', lambda detections, model: 'seen')
+    matched = None if outcome == 'none' else 'match'
+    monkeypatch.setattr(extraction, 'follow', lambda seen, model, view, scale_px: matched)
+    monkeypatch.setattr(extraction, '_measured', lambda *given: 'anew')
+    first = Fake(
+        detections=Fake(radius_px=2.6, inverted=True),
+        imaging=Fake(profile=Fake(radius_px=fitted_px)),
+        view=None,
+        match=Fake(scale_px=0.1),
+    )
+    assert extraction._detected_anew(None, first, Fake(xyz=np.zeros((36, 3)))) == expected
+    assert [(look.radius_px, look.inverted) for look in looks] == (
+        [] if fitted_px == 5.1 else [(fitted_px, True)]
+    )
+
+
 def found_with(bead, refused=()):
     n = len(bead)
     return extraction.Extraction(
@@ -287,6 +318,7 @@ def test_looks_are_tried_in_their_order_until_a_pose_is_sure(monkeypatch):
 
         monkeypatch.setattr(extraction, 'match', match)
         monkeypatch.setattr(extraction, '_measured', lambda *given: given[:3])
+        monkeypatch.setattr(extraction, '_detected_anew', lambda *given: None)
         try:
             return extraction._searched(None, Fake(xyz=np.zeros((4, 3))), None), tried
         except DataError as error:

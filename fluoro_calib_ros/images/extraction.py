@@ -161,29 +161,29 @@ def _detected_anew(
     radius_px = extraction.imaging.profile.radius_px
     if found.radius_px / MOST < radius_px < found.radius_px * MOST:
         return None
-    try:
-        detections = detect_beads(image, len(model.xyz), Look(radius_px, found.inverted))
-        seen = _seen(detections, model)
-        matched = follow(seen, model, extraction.view, extraction.match.scale_px)
-        return None if matched is None else _measured(detections, seen, matched, model)
-    except DataError:
-        return None
+    look = Look(radius_px, found.inverted)
+    return _tracked(image, model, extraction.nearby, look=look, imaging=None)
 
 
 def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extraction | None:
     """Extract beads by tracking from a nearby exposure; return None if that finds no pose."""
+    tracked = _tracked(image, model, near, look=near.look, imaging=near.imaging)
+    return None if tracked is None else replace(tracked, followed=True)
+
+
+def _tracked(
+    image: np.ndarray, model: PhantomModel, near: Nearby, look: Look, imaging: Imaging | None
+) -> Extraction | None:
+    """Extract beads of some appearance near a pose; return None if that finds no pose."""
     try:
-        detections = detect_beads(image, len(model.xyz), near.look)
+        detections = detect_beads(image, len(model.xyz), look)
         if image.shape != near.view.lens.image_size[::-1]:
             return None
         seen = _seen(detections, model)
         found = follow(seen, model, near.view, near.scale_px, near.far)
-        if found is None:
-            return None
-        followed = _measured(detections, seen, matched=found, model=model, imaging=near.imaging)
+        return None if found is None else _measured(detections, seen, found, model, imaging)
     except DataError:
         return None
-    return replace(followed, followed=True)
 
 
 def _seen(detections: Detections, model: PhantomModel) -> Seen:

@@ -255,15 +255,16 @@ def test_beads_are_detected_anew_by_their_fitted_size(monkeypatch, fitted_px, ou
     monkeypatch.setattr(extraction, 'detect_beads', detect)
     monkeypatch.setattr(extraction, '_seen', lambda detections, model: 'seen')
     matched = None if outcome == 'none' else 'match'
-    monkeypatch.setattr(extraction, 'follow', lambda seen, model, view, scale_px: matched)
+    monkeypatch.setattr(extraction, 'follow', lambda *given: matched)
     monkeypatch.setattr(extraction, '_measured', lambda *given: 'anew')
     first = Fake(
         detections=Fake(radius_px=2.6, inverted=True),
         imaging=Fake(profile=Fake(radius_px=fitted_px)),
-        view=None,
-        match=Fake(scale_px=0.1),
+        nearby=Fake(view=Fake(lens=Fake(image_size=(4, 3))), scale_px=0.1, far=None),
     )
-    assert extraction._detected_anew(None, first, Fake(xyz=np.zeros((36, 3)))) == expected
+    assert (
+        extraction._detected_anew(np.zeros((3, 4)), first, Fake(xyz=np.zeros((36, 3)))) == expected
+    )
     assert [(look.radius_px, look.inverted) for look in looks] == (
         [] if fitted_px == 5.1 else [(fitted_px, True)]
     )

@@ -85,6 +85,9 @@ class Match:
     explained: float
     scale_px: float  #: robust standard deviation of the residuals
     expected: int  #: number of beads predicted in the field
+    #: number of predicted beads that are not found, and of detections among them that are not
+    #: predicted
+    against: int
     #: logarithm of the likelihood of the beads that are found, over that for detections anywhere
     evidence: float
 
@@ -222,6 +225,7 @@ def _judged(
         seen.uv, distance_upper_bound=max(tolerance, 1.2 * seen.radius_px)
     )
     within, area = _outlined(seen.uv, predicted[row], seen.field.shape)
+    is_explained = np.isfinite(prediction_distance[within])
     by_chance = -float(np.expm1(-np.pi * tolerance**2 * within.sum() / area))
     good = _good_cells(predicted[row], is_found, seen.field.shape)
     # A detection between two predictions may belong to either.
@@ -238,9 +242,10 @@ def _judged(
         detection=detection[accepted],
         predicted=predicted,
         found=float(np.mean(is_found)),
-        explained=float(np.isfinite(prediction_distance[within]).sum() / max(within.sum(), 1)),
+        explained=float(is_explained.sum() / max(within.sum(), 1)),
         scale_px=scale,
         expected=len(row),
+        against=int(np.sum(~is_found) + np.sum(~is_explained)),
         evidence=_evidence(is_found[spacing >= 2 * seen.radius_px], by_chance),
     )
 

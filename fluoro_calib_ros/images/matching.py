@@ -11,9 +11,8 @@ turned by one of its symmetries.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +20,8 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
-from ..photogrammetry.rotations import rotation_angle
 from .growth import LAST_TOLERANCE_PX, Match, Seen, grow, settle, start_view
-from .lattice import CENTRAL, REACH, STEPS, FlatGrid, GridPose, grid_poses
+from .lattice import CENTRAL, STEPS, FlatGrid, GridPose, grid_poses
 from .pose_search import (
     MERGED,
     MIN_EXPLAINED,
@@ -34,7 +32,8 @@ from .pose_search import (
     nearby_map,
     triples_of,
 )
-from .view import Lens, View, fit_view
+from .symmetries import Symmetry, symmetries_of
+from .view import Lens, fit_view
 
 MIN_BEADS = 10
 # Shares found and explained from which a pose is accepted. If many beads overlap, fewer are
@@ -45,10 +44,6 @@ SURE = ((0.85, MIN_EXPLAINED), (0.75, 0.95))
 # Least evidence of a pose: a million poses are tried, and one image in a million may show another
 # pose by chance.
 MIN_EVIDENCE = float(2 * np.log(1e6))
-# Least lead in score of the best pose over any other, as a share of the score and in beads. Beads
-# missed by chance make a smaller difference.
-MARGIN = 0.06
-MARGIN_BEADS = 8
 NEIGHBOURS = (8, 6)  # of a bead in phantom and image, which form triples with it
 # Levels of the search: range of beads tried, and limits of the scale relative to that from the
 # extent of the detections. The first level finds most poses, the second those that see all faces
@@ -65,37 +60,13 @@ APART = 0.6  # share of the beads, those farthest from their neighbours, that ar
 AGREED = 3  # matches of the same pose after which the search ends if the pose is evident
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes distinguish beads
 LIKELIER = 10.0  # least lead in log-likelihood of a pose over any other
-SIZE_TAIL = 6.0  # residual of a response at which it is clipped [standard deviations]
+SIZE_TAIL = 3.0  # residual from which a response is an outlier [standard deviations]
 SIZE_NEIGHBOURS = 12  # neighbours from which the usual response is estimated
 # Bounds of the slope of log response over log radius r. A disc has r^2 exp(-r^2 / 2 s^2) at a
 # scale s, where r < 1.2 s; a small sphere has its thickness as an additional factor.
 SIZE_SLOPES = (0.5, 3.0)
 CLOSER = 2.0  # ratio of the residuals of two poses that decides between them
-SYMMETRY_SHARE = 0.4  # least share of the beads that a symmetry moves close to a bead
-SHIFTS = 6  # number of shifts to neighbours that are candidates of symmetries
 SCALE_BY_SIZE = (0.55, 1.6)  # ratio of a bead's image to its diameter, with the blur
-
-
-@dataclass(frozen=True)
-class Symmetry:
-    """Motion of a phantom that moves many of its beads close to others."""
-
-    rotation: NDArray[np.float64]  #: (3, 3)
-    shift: NDArray[np.float64]  #: (3,) [mm]
-    row: NDArray[np.int64]  #: (n,), row of the bead to which each bead is moved, -1 for none
-
-    @property
-    def turn_rad(self) -> float:
-        """Angle of the rotation."""
-        return float(rotation_angle(self.rotation))
-
-    def turned(self, view: View) -> View:
-        """Return the view that sees the moved phantom as this view sees the phantom."""
-        return replace(
-            view,
-            rotation=view.rotation @ self.rotation.T,
-            position=self.rotation @ view.position + self.shift,
-        )
 
 
 @dataclass(frozen=True)
@@ -104,7 +75,6 @@ class PhantomModel:
 
     xyz: NDArray[np.float64]  #: (n, 3) [mm]
     diameter_mm: NDArray[np.float64] | None  #: (n,)
-    symmetries: tuple[Symmetry, ...]
     grid: FlatGrid | None  #: for a flat grid
     #: any of several poses that fit equally well is accepted: a regular grid looks alike in all
     regular: bool = False
@@ -126,7 +96,6 @@ class PhantomModel:
         return cls(
             xyz,
             diameter_mm,
-            symmetries=tuple(_symmetries(xyz)),
             grid=grid,
             regular=regular,
         )
@@ -141,6 +110,11 @@ class PhantomModel:
     def spacing_mm(self) -> float:
         """Median distance of a bead from the nearest one."""
         return float(np.median(cKDTree(self.xyz).query(self.xyz, k=[2])[0]))
+
+    @cached_property
+    def symmetries(self) -> tuple[Symmetry, ...]:
+        """Motions that move many beads close to others, computed on first use."""
+        return symmetries_of(self.xyz)
 
     @cached_property
     def triples(self) -> Triples:
@@ -195,7 +169,9 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
         # A right pose is among the first; others that fit as well may come later.
         if (len(fitted) if best else number) >= FITTED:
             break
-        if best and (model.regular or not _could_be(pose, best[0])):
+        if best and model.regular:
+            break
+        if best and not _could_be(pose.against - best[0].against, pose.numbered, best[0].against):
             break
         match = pose.fit()
         if match is None:
@@ -215,14 +191,22 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
     return by_size
 
 
-def _could_be(pose: GridPose, best: GridPose) -> bool:
-    """Return whether a pose of a grid is too likely for the best pose to be certain.
+def _could_be(more: float, beads: int, against: float) -> bool:
+    """Return whether a pose is too likely for the best pose to be certain.
 
-    The probability that a bead is missing, or that something else is detected in its place, is
-    estimated from the best pose, with one more such event than it shows.
+    The probability of a contradiction, that a bead is missing or that something else is detected,
+    is estimated from the best pose, with one more than it shows.
+
+    Parameters
+    ----------
+    more : float
+        Number of contradictions to the pose beyond those to the best pose.
+    beads : int
+        Number of beads found with the best pose.
+    against : float
+        Number of contradictions to the best pose.
     """
-    log_odds = np.log(best.numbered / (best.against + 1))
-    return bool((pose.against - best.against) * log_odds < LIKELIER)
+    return bool(more * np.log(beads / (against + 1)) < LIKELIER)
 
 
 def _ambiguous(best: Match, other: Match) -> DataError:
@@ -296,8 +280,12 @@ def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = 
     if model.regular:
         return best
     climbed, rivals = _climbed(best, seen, model, turn_rad)
-    limit = climbed.score - max(MARGIN_BEADS, MARGIN * climbed.score)
-    equal = [rival for rival in rivals if rival.score > limit and not _same(rival, climbed)]
+    equal = [
+        rival
+        for rival in rivals
+        if _could_be(climbed.score - rival.score, len(climbed.bead), climbed.against)
+        and not _same(rival, climbed)
+    ]
     closest = min([climbed, *equal], key=lambda candidate: candidate.scale_px)
     if all(
         candidate is closest or candidate.scale_px > CLOSER * closest.scale_px
@@ -345,6 +333,9 @@ def _likelihood_of_sizes(
 
     A response is linear in the size, and changes slowly across the image. Its scatter is that of
     the beads around: it is larger at the edge of a sheet, so that a mark elsewhere stands out.
+    Responses of beads that overlap or that lie before an edge are outliers, with any residual up
+    to the largest. The probability of an outlier is that among the beads around, one of which
+    stands for the whole image.
     """
     _, near = cKDTree(uv).query(uv, k=min(SIZE_NEIGHBOURS + 1, len(uv)))
     x = size - size[near].mean(axis=1)
@@ -353,9 +344,14 @@ def _likelihood_of_sizes(
     level = response - slope * size
     local_level = np.median(level[near], axis=1)
     scatter = 1.4826 * np.median(np.abs(level[near] - local_level[:, None]), axis=1)
-    scatter = np.maximum(scatter, np.median(scatter))
-    residual = np.minimum(np.abs(level - local_level) / np.maximum(scatter, 1e-6), SIZE_TAIL)
-    return float(-np.sum(np.log(np.maximum(scatter, 1e-6))) - 0.5 * np.sum(residual**2))
+    scatter = np.maximum(np.maximum(scatter, np.median(scatter)), 1e-6)
+    residual = np.abs(level - local_level) / scatter
+    outlier = residual > SIZE_TAIL
+    usual = (np.count_nonzero(outlier) + 1) / (len(uv) + 1)
+    share = (np.sum(outlier[near[:, 1:]], axis=1) + usual) / near.shape[1]
+    normal = np.exp(-0.5 * residual**2) / np.sqrt(2 * np.pi)
+    uniform = 0.5 / max(float(residual.max()), SIZE_TAIL)
+    return float(np.sum(np.log(((1 - share) * normal + share * uniform) / scatter)))
 
 
 def _climbed(
@@ -460,45 +456,3 @@ def _scale_by_extent(seen: Seen, model: PhantomModel) -> float:
     spread = np.sqrt(np.mean(np.sum((seen.uv - np.median(seen.uv, axis=0)) ** 2, axis=1)))
     extent = np.sqrt(np.mean(np.sum((model.xyz - model.xyz.mean(axis=0)) ** 2, axis=1)))
     return float(spread / (np.sqrt(2 / 3) * extent))
-
-
-def _symmetries(xyz: NDArray[np.float64]) -> Iterator[Symmetry]:
-    """Yield motions of a phantom (n, 3) onto itself: rotations, and shifts by a neighbour.
-
-    The rotations are the 24 of a cube, about the phantom's axes and its principal axes.
-    """
-    centre = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
-    tree = cKDTree(xyz)
-    distance, near = tree.query(xyz, k=min(SHIFTS + 1, len(xyz)))
-    reach = REACH * float(np.median(distance[:, 1]))
-    _, _, principal = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
-    seen: set[bytes] = {np.arange(len(xyz)).tobytes()}
-    turns = [axes.T @ turn @ axes for axes in (np.eye(3), principal) for turn in _turns_of_cube()]
-    candidates = [(turn, centre - turn @ centre) for turn in turns]
-    steps = (xyz[near[:, 1:]] - xyz[:, None]).reshape(-1, 3)
-    common = _common(steps, reach)
-    candidates += [(np.eye(3), step) for step in common]
-    for rotation, shift in candidates:
-        offset, row = tree.query(xyz @ rotation.T + shift)
-        row = np.where(offset < reach, row, -1)
-        if np.mean(row >= 0) >= SYMMETRY_SHARE and row.tobytes() not in seen:
-            seen.add(row.tobytes())
-            yield Symmetry(rotation, shift, row)
-
-
-def _turns_of_cube() -> Iterator[NDArray[np.float64]]:
-    """Yield the 24 rotations (3, 3) of a cube."""
-    for order in permutations(range(3)):
-        for signs in product((-1.0, 1.0), repeat=3):
-            turn = np.zeros((3, 3))
-            turn[range(3), order] = signs
-            if np.linalg.det(turn) > 0:
-                yield turn
-
-
-def _common(steps: NDArray[np.float64], reach: float) -> list[NDArray[np.float64]]:
-    """Return the most frequent steps (3,) to a neighbour among steps (n, 3)."""
-    cell = np.rint(steps / max(2 * reach, 1e-9)).astype(int)
-    _, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(-count, kind='stable')[: 2 * SHIFTS]
-    return [steps[inverse.ravel() == number].mean(axis=0) for number in order]

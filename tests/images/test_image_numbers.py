@@ -106,7 +106,14 @@ def test_predictions_are_paired_with_what_is_nearest():
 
 def test_score_of_a_match_counts_what_is_missing():
     empty = np.zeros(0)
-    known = {'found': 0.9, 'explained': 1, 'scale_px': 1, 'expected': 40, 'evidence': 100}
+    known = {
+        'found': 0.9,
+        'explained': 1,
+        'scale_px': 1,
+        'expected': 40,
+        'against': 4,
+        'evidence': 100,
+    }
     one = Match(None, np.arange(30), empty, empty, **known)
     assert one.score == pytest.approx(26)
 

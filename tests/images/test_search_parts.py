@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
-from fluoro_calib_ros.images import growth, matching, pose_search
+from fluoro_calib_ros.images import growth, pose_search
 from fluoro_calib_ros.images.clipping import UNCLIPPED
 from fluoro_calib_ros.images.detection import PIXELS_AT_ONCE, responses
 from fluoro_calib_ros.images.growth import (
@@ -32,7 +32,6 @@ from fluoro_calib_ros.images.marker_fit import _MarkerFit
 from fluoro_calib_ros.images.marker_intensity import LightWindows, Shadows, check_image
 from fluoro_calib_ros.images.marker_motion import GIVEN_SD_PX, MeasuredMarkers, Motion
 from fluoro_calib_ros.images.marker_watch import MarkerDoubts, MarkerWatch
-from fluoro_calib_ros.images.matching import SHIFTS, _common
 from fluoro_calib_ros.images.pose_search import (
     LocalPose,
     _chances,
@@ -289,29 +288,6 @@ def test_the_scale_of_residuals_is_that_of_normal_ones():
     squared = np.sum(np.random.default_rng(4).normal(0, 1.5, (20000, 2)) ** 2, axis=1)
     assert _scale(squared) == pytest.approx(1.5**2, rel=0.03)
     assert _scale(np.zeros(4)) > 0
-
-
-# ---- symmetries
-
-
-def test_steps_that_occur_most_often_may_be_those_of_a_symmetry():
-    jitter = np.array([[-0.1, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, -0.2, 0.1], [0, 0, -0.1]])
-    often, less = [11.0, 0, 0] + jitter, [12.0, 0, 0] + jitter[:3]
-    found = _common(np.concatenate([less, often, [[0, 30.0, 0]]]), 0.5)
-    expected = [often.mean(axis=0), less.mean(axis=0), [0, 30, 0]]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-    many = np.arange(4 * SHIFTS)[:, None] * [10.0, 0, 0]
-    assert len(_common(many, 0.5)) == 2 * SHIFTS
-
-
-def test_steps_to_six_neighbours_are_candidates_of_symmetries(monkeypatch):
-    given = []
-    monkeypatch.setattr(matching, '_common', lambda *args: given.append(args) or [])
-    list(matching._symmetries(BEADS))
-    ((steps, reach),) = given
-    distance, near = cKDTree(BEADS).query(BEADS, k=7)
-    np.testing.assert_allclose(steps, (BEADS[near[:, 1:]] - BEADS[:, None]).reshape(-1, 3))
-    assert reach == pytest.approx(0.3 * np.median(distance[:, 1]))
 
 
 # ---- markers

@@ -252,6 +252,48 @@ def frame(beads: int, side: float = 140.0, diameter: float = 2.0) -> Callable[..
     return drawn
 
 
+def lattice(count: int, missing: int, pitch: float = 16.0) -> Callable[..., Target]:
+    """Return a cubic lattice of count ** 3 beads, some of which are missing."""
+
+    def drawn(rng: np.random.Generator) -> Target:
+        places = np.stack(np.meshgrid(*3 * [np.arange(count)], indexing='ij'), axis=-1)
+        xyz = pitch * (places.reshape(-1, 3) - (count - 1) / 2)
+        xyz = np.delete(xyz, rng.permutation(len(xyz))[:missing], axis=0)
+        return Target(xyz, np.full(len(xyz), 3.0))
+
+    return drawn
+
+
+def rings(beads: int, marks: int) -> Callable[..., Target]:
+    """Return two rings of beads around a cylinder, with more beads between them."""
+
+    def drawn(rng: np.random.Generator) -> Target:
+        xyz = _around(2 * np.pi / beads * np.arange(2 * beads), np.repeat([-30.0, 30.0], beads))
+        while len(xyz) < 2 * beads + marks:
+            new = _around(rng.uniform(0, 2 * np.pi, 1), rng.uniform(-25, 25, 1))
+            if np.linalg.norm(xyz - new, axis=1).min() > 9.0:
+                xyz = np.concatenate([xyz, new])
+        return Target(xyz, np.full(len(xyz), 3.0))
+
+    return drawn
+
+
+def helix(beads: int, missing: int, sizes: tuple[float, ...] = (2.5,)) -> Callable[..., Target]:
+    """Return a helix of beads of random sizes around a cylinder, some of which are missing."""
+
+    def drawn(rng: np.random.Generator) -> Target:
+        along = np.delete(np.linspace(-0.5, 0.5, beads), rng.permutation(beads)[:missing])
+        xyz = _around(2 * np.pi * 3.3 * along, 100.0 * along)
+        return Target(xyz, rng.choice(sizes, len(xyz)))
+
+    return drawn
+
+
+def _around(angle: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return points (n, 3) on a cylinder of 40 mm radius."""
+    return np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), z])
+
+
 def nothing(_: np.random.Generator) -> Target:
     """Return no phantom."""
     return Target(np.empty((0, 3)), np.empty(0))
@@ -289,6 +331,14 @@ ROWS: dict[str, Row] = {
     ),
     'cube-48 three sizes': Row(three_sizes(48), told=True),
     'cube-48 three sizes untold': Row(three_sizes(48)),
+    'lattice of 64, 6 missing': Row(lattice(4, 6)),
+    'lattice of 64, 6 missing, bone': Row(lattice(4, 6), bone=True),
+    'lattice of 64': Row(lattice(4, 0)),
+    'two rings of 11 and 4 beads': Row(rings(11, 4)),
+    'two rings of 11': Row(rings(11, 0)),
+    'helix of 60, 6 missing': Row(helix(60, 6)),
+    'helix of 60, two sizes': Row(helix(60, 0, (2.5, 4.0)), told=True),
+    'helix of 60': Row(helix(60, 0)),
     'grid of beads': Row(sheet(20, 5.0, False, 2), tilt_deg=15.0),
     **{
         f'{"hexagonal" if hexagonal else "square"} sheet {count} with {marks} marks': Row(

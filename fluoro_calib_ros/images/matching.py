@@ -377,7 +377,11 @@ def _alternatives(
     for symmetry in symmetries:
         moved_bead = symmetry.row[best.bead]
         known = moved_bead >= 0
-        if np.count_nonzero(known) < MIN_BEADS:
+        # Beads that are moved to where the phantom has none contradict the other pose. It may
+        # explain what contradicts this one.
+        more = np.count_nonzero(~known) - best.against
+        is_likely = _could_be(more, len(best.bead), best.against)
+        if np.count_nonzero(known) < MIN_BEADS or not is_likely:
             continue
         view, scale = fit_view(
             symmetry.turned(best.view),

@@ -30,7 +30,7 @@ MIN_SHARE = 0.4  # least share of the beads that a symmetry moves close to a bea
 # Motions that are tried, those first that move the middle of the phantom least: they overlap most.
 TRIED = 300
 SAMPLE = 200  # beads by which the best motions are selected
-KEPT = 60  # symmetries that are kept: 24 rotations of a cube, and shifts
+KEPT = 120  # symmetries that are kept: 24 rotations of a cube, also after a step of a lattice
 
 
 @dataclass(frozen=True)

@@ -515,6 +515,24 @@ def test_of_poses_that_fit_alike_sizes_tell(monkeypatch, rivals, by_size, taken)
     assert matching.unambiguous(first, seen, Fake(regular=True)) is first
 
 
+def test_outliers_of_responses_do_not_decide_between_poses():
+    """Three of 64 beads are larger, and every seventh response is that of beads that overlap."""
+    rng = np.random.default_rng(5)
+    size = np.where(np.arange(64) < 3, 0.4, 0.0)
+    decided = []
+    for _ in range(60):
+        uv = rng.uniform(100, 900, (64, 2))
+        outlier = np.where(rng.random(64) < 0.15, rng.uniform(-1.5, 1.5, 64), 0)
+        response = 2 * size + rng.normal(0, 0.1, 64) + outlier
+        sizes = [size, *(rng.permutation(size) for _ in range(23))]
+        likelihoods = [matching._likelihood_of_sizes(one, response, uv) for one in sizes]
+        order = np.argsort(likelihoods)
+        if likelihoods[order[-1]] - likelihoods[order[-2]] > matching.LIKELIER:
+            decided.append(order[-1])
+    assert len(decided) > 10
+    assert set(decided) == {0}
+
+
 def bodies_that_learn(monkeypatch, known):
     """Return MarkerBodies of a body with four markers, the data for its shape, and its updates."""
     learned = []

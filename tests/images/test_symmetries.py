@@ -58,7 +58,7 @@ def test_symmetries_move_beads_to_beads():
         assert not np.array_equal(one.row, np.arange(len(xyz)))
     steps = [one.shift for one in found if one.turn_rad < 1e-6]
     along = {tuple(np.rint(TURN.inv().apply(step)).astype(int)) for step in steps}
-    assert along >= {(10, 0, 0), (-10, 0, 0)}
+    assert along >= {(10, 0, 0), (-10, 0, 0), (0, 10, 0), (0, 0, -10)}
 
 
 @pytest.mark.parametrize('count', [7, 9, 12])
@@ -80,7 +80,7 @@ def test_a_helix_is_screwed_by_its_steps_also_where_beads_are_missing():
 def test_beads_that_are_made_by_hand_are_nearly_symmetric():
     xyz = lattice(4, 4, 4, 16.0)
     found = symmetries_of(xyz + np.random.default_rng(2).normal(0, 0.8, xyz.shape))
-    assert sum(one.share > 0.9 for one in found) == 23
+    assert sum(one.share > 0.9 for one in found) >= 23
     assert symmetries_of(np.random.default_rng(3).uniform(-50, 50, (36, 3))) == ()
 
 

@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from ..correction.base import CorrectionModel
 from ..correction.fluoroscope_calibration import (
@@ -35,6 +34,7 @@ from ..photogrammetry.precision import (
 )
 from ..photogrammetry.rig_orientation import KnownOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
+from ..photogrammetry.threads import one_thread
 from ..rows import joined_rows
 from .constraints import connected_frames, relative_orientations
 from .fixed_calibration import (
@@ -128,7 +128,7 @@ def calibrate_request(
     calibrations: dict[str, FluoroscopeCalibration] = {}
     runs: dict[str, SelfCalibration] = {}
     # One thread is faster than two for these sizes, and keeps the order of summation fixed.
-    with threadpool_limits(1):
+    with one_thread():
         for group in request.groups:
             start = time.perf_counter()
             label = '+'.join(group)
@@ -186,7 +186,7 @@ def calibrate_part(
     exposures, whose image noise is used. Raises DataError if the exposures do not suffice.
     """
     out: dict[str, FluoroscopeCalibration] = {}
-    with threadpool_limits(1):
+    with one_thread():
         for group in request.groups:
             start = time.perf_counter()
             frames = {name: request.frames[name] for name in group}
@@ -324,7 +324,7 @@ def adjust_with_calibrations(
     for name, exposures in frames.items():
         for frame in exposures:
             validate_frame(frame, phantom, calibrations[name].image_size)
-    with threadpool_limits(1):
+    with one_thread():
         measured = network_of_calibrations(
             frames, phantom, calibrations=calibrations, known=known, starts=starts
         )

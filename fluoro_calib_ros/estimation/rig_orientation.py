@@ -26,7 +26,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from threadpoolctl import threadpool_limits
 
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
@@ -44,6 +43,7 @@ from ..photogrammetry.precision import (
 )
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
 from ..photogrammetry.rotations import matrix_from_quaternion, nearest_rotation
+from ..photogrammetry.threads import one_thread
 from ..photogrammetry.unknowns import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
@@ -183,7 +183,7 @@ def orientation_of_capture(
                 f'fluoroscope {name}: the capture shows {len(frame.target_id)} targets of the '
                 f'phantom, {MIN_TARGETS_OF_EXPOSURE} are needed'
             )
-    with threadpool_limits(1):
+    with one_thread():
         measured = network_of_calibrations(standing, phantom, calibrations)
         fixed = _adjusted(measured, calibrations, True)
     parameters = fixed.after.parameters
@@ -215,7 +215,7 @@ def orientation_and_scatter(
     """
     _validate(frames, phantom, calibrations)
     paired = _paired(frames)
-    with threadpool_limits(1):
+    with one_thread():
         measured = network_of_calibrations(paired, phantom, calibrations, starts=starts)
         fixed = _adjusted(measured, calibrations, False)
         turning = {

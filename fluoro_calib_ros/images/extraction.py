@@ -6,16 +6,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import chndtr
-from threadpoolctl import ThreadpoolController
 
 from ..errors import DataError
 from ..findings import Finding, Kind
+from ..photogrammetry.threads import one_thread
 from .contrasts import black_level, usual_depth
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
@@ -123,14 +122,9 @@ def extract_beads(
     the reason, if there is no phantom in the image, or its pose is not certain.
     """
     # Small matrices take three times as long on several threads.
-    with _threads().limit(limits=1):
+    with one_thread():
         followed = None if near is None else _followed(image, model, near)
         return followed or _searched(image, model, lens)
-
-
-@cache
-def _threads() -> ThreadpoolController:
-    return ThreadpoolController()
 
 
 def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:

@@ -167,11 +167,16 @@ def squared_residuals(
     They are infinite for points in the plane of the source.
     """
     # Points are on the last axis: a sum over an axis of two would take ten times as long.
-    x = projection[..., :-1] @ np.swapaxes(xyz, -1, -2) + projection[..., -1:]
+    # Arrays of many projections do not fit into the cache: work in place.
+    x = projection[..., :-1] @ np.swapaxes(xyz, -1, -2)
+    x += projection[..., -1:]
     with np.errstate(divide='ignore', invalid='ignore'):
-        r = (x[..., 0, :] / x[..., 2, :] - uv[..., 0]) ** 2
-        r += (x[..., 1, :] / x[..., 2, :] - uv[..., 1]) ** 2
-    return np.where(np.isfinite(r), r, np.inf)
+        u, v = (x[..., axis, :] / x[..., 2, :] - uv[..., axis] for axis in (0, 1))
+        u *= u
+        v *= v
+        u += v
+    u[~np.isfinite(u)] = np.inf
+    return u
 
 
 def robust_variance(squared: NDArray[np.float64]) -> float:

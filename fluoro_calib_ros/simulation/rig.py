@@ -393,8 +393,7 @@ def simulate_tracking(
     shapes = [rng.uniform(-22, 22, (CLUSTER_MARKERS, 3)) for _ in CLUSTER_CENTRES[:clusters]]
     ids = np.arange(1001, 1001 + CLUSTER_MARKERS * len(shapes))
     times_s = [index / rate_hz for index in range(round(seconds * rate_hz))]
-    points = np.array([_markers_at(time_s, shapes) for time_s in times_s])
-    points = points.reshape(len(times_s), len(ids), 3)
+    points = _markers_at(times_s, shapes)
     frames, ideal = image_frames(
         rig, points, ids, times_s, noise_px=noise_px, rng=rng, start=start
     )
@@ -431,19 +430,29 @@ def image_frames(
     return frames, ideal
 
 
-def _markers_at(time_s: float, shapes: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return positions (k, 3) [mm] of all markers at a time [s]; shapes: clusters (6, 3) [mm]."""
-    t = time_s
-    bend = np.deg2rad(25) * np.sin(2 * np.pi * 0.5 * t)
+def _markers_at(
+    times_s: Sequence[float], shapes: list[NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Return positions (T, k, 3) [mm] of all markers at times (T,) [s].
+
+    shapes: clusters (6, 3) [mm].
+    """
+    bends = [np.deg2rad(25) * np.sin(2 * np.pi * 0.5 * t) for t in times_s]
     sway = 70 * np.array(
-        [np.sin(2 * np.pi * 0.31 * t), np.cos(2 * np.pi * 0.23 * t), 0.6 * np.sin(t)]
-    )
-    points = []
+        [
+            [np.sin(2 * np.pi * 0.31 * t), np.cos(2 * np.pi * 0.23 * t), 0.6 * np.sin(t)]
+            for t in times_s
+        ]
+    ).reshape(-1, 1, 3)
+    points = [np.zeros((len(times_s), 0, 3))]
     for number, (shape, centre) in enumerate(zip(shapes, CLUSTER_CENTRES)):
-        about_x = bend if number < 2 else -bend
-        rotation = matrix_from_vector([about_x, 0.3 * np.sin(1.1 * t + number), 0])
-        points.append((shape + centre) @ rotation.T + sway)
-    return np.concatenate(points) if points else np.zeros((0, 3))
+        vectors = [
+            [bend if number < 2 else -bend, 0.3 * np.sin(1.1 * t + number), 0]
+            for bend, t in zip(bends, times_s)
+        ]
+        rotations = matrix_from_vector(np.reshape(vectors, (-1, 3)))
+        points.append((shape + centre) @ np.swapaxes(rotations, 1, 2) + sway)
+    return np.concatenate(points, axis=1)
 
 
 def simulate_grid(

@@ -49,14 +49,20 @@ def known(names='ab'):
 
 
 @functools.cache
+def tracked(seed, seconds, rate_hz):
+    """Frames of all fluoroscopes by name."""
+    return simulate_tracking(rig(), seconds, rate_hz, seed=seed, noise_px=NOISE_PX).frames
+
+
+@functools.cache
 def recorded(steps, names='ab', seed=4, seconds=2.0, rate_hz=RATE_HZ):
     """Frames of which those of the last fluoroscope are late by quarters of a frame interval."""
-    tracking = simulate_tracking(rig(), seconds, 4 * rate_hz, seed=seed, noise_px=NOISE_PX)
+    frames = tracked(seed, seconds, 4 * rate_hz)
     late = {name: steps if name == names[-1] else 0 for name in names}
     return {
         name: [
             replace(frame, number=(frame.number - late[name]) // 4)
-            for frame in tracking.frames[name][4 + late[name] :: 4]
+            for frame in frames[name][4 + late[name] :: 4]
         ]
         for name in names
     }

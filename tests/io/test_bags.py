@@ -565,7 +565,7 @@ def test_truncated_bag_is_reported(tmp_path):
 def test_recording_of_more_files_than_may_be_open_is_read(tmp_path, monkeypatch):
     """Files whose times overlap are merged."""
     monkeypatch.setattr(os, 'fsync', lambda _: None)
-    count = 60
+    count = 20
     with BagWriter(tmp_path / 'run', live=True) as bag:
         for number in range(1, count + 1):
             for log_time in (100 * number, 100 * number + 150):

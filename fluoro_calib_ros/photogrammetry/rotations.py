@@ -157,5 +157,5 @@ def left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
         first = np.where(is_small, first, (1 - np.cos(a)) / a**2)
         second = np.where(is_small, second, (a - np.sin(a)) / a**3)
     out = first * k + second * (k @ k)
-    out[..., (0, 1, 2), (0, 1, 2)] += 1.0
+    out.reshape(*w.shape[:-1], 9)[..., ::4] += 1.0  # the diagonal
     return out

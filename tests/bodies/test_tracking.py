@@ -17,7 +17,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
 
 RATE = 250.0
-COUNT = 90
+COUNT = 60
 
 
 class Trial:
@@ -178,7 +178,7 @@ def hide(first, last, keep):
     ],
 )
 def test_gaps_are_filled_and_marked(keep, status):
-    trial = Trial(2, hidden=hide(50, 65, keep))
+    trial = Trial(2, hidden=hide(50, 65, keep), count=75)
     tracker, _ = trial.follow()
     poses = poses_of(trial.bodies, tracker.smoothed())[0]
     away, sd = trial.errors(poses, 0)
@@ -189,7 +189,7 @@ def test_gaps_are_filled_and_marked(keep, status):
 
 
 def test_a_body_that_is_away_for_long_has_no_pose_until_it_is_seen_again():
-    trial = Trial(3, hidden=hide(20, 80, []))
+    trial = Trial(3, hidden=hide(20, 80, []), count=90)
     _, found = trial.follow(lag=0)
     status = np.array([one.status[0] for one in found])
     assert status[78] == PoseStatus.FAILED and np.isnan(found[78].rotation[0]).all()

@@ -113,7 +113,7 @@ def test_what_the_rig_file_does_not_say_is_required_as_before(rig, capsys):
 
 
 def test_what_the_file_says_about_the_rig_is_in_the_report(rig, tmp_path, monkeypatch):
-    monkeypatch.setattr(html_report, 'svg_text', lambda figure: '')
+    monkeypatch.setattr(html_report, '_figures', lambda *_: [])
     folder = tmp_path / 'data'
     assert run('simulate', '--out', folder, '--exposures', 5, '--seconds', 0.05) == 0
     file = rig('[about]\nsite = "<gait> laboratory"\nkV = 80\n')

@@ -57,23 +57,30 @@ def merged(rng, of_each, most_behind=None):
     out = []
     while any(left.values()):
         first = min(of_one[0].row for of_one in left.values() if of_one)
-        name = rng.choice(
-            [
-                name
-                for name, of_one in left.items()
-                if of_one and (most_behind is None or of_one[0].row <= first + most_behind)
-            ]
-        )
-        out.append(left[name].pop(0))
+        ready = [
+            of_one
+            for of_one in left.values()
+            if of_one and (most_behind is None or of_one[0].row <= first + most_behind)
+        ]
+        out.append(ready[rng.integers(len(ready))].pop(0))
     return out
+
+
+def orders(places):
+    """Return all different orders of the letters of a word."""
+    return [
+        first + rest
+        for first in sorted(set(places))
+        for rest in orders(places.replace(first, '', 1))
+    ] or ['']
 
 
 def expected(of_each, min_views=2):
     """Return [(row, names)] of the exposures with enough views."""
-    rows = sorted({f.row for of_one in of_each.values() for f in of_one})
+    rows = {name: {f.row for f in of_one} for name, of_one in of_each.items()}
     there = [
-        (row, {name for name, of_one in of_each.items() if row in {f.row for f in of_one}})
-        for row in rows
+        (row, {name for name, of_one in rows.items() if row in of_one})
+        for row in sorted(set().union(*rows.values()))
     ]
     return [(row, names) for row, names in there if len(names) >= min_views]
 
@@ -100,7 +107,7 @@ def test_every_order_of_arrival_gives_each_exposure_once_and_in_order(by, lost):
     }
     wanted = expected(of_each)
     places = ''.join(name * len(of_one) for name, of_one in of_each.items())
-    for order in set(itertools.permutations(places)):
+    for order in orders(places):
         rows = {name: iter(of_one) for name, of_one in of_each.items()}
         pairer = exposure_pairer('abc', RecordedPairing(by).unlimited())
         assert paired(pairer, [next(rows[name]) for name in order], flush=False) == wanted

@@ -359,7 +359,8 @@ def discs(rng, light, contrast, size=512):
     v, u = np.mgrid[:size, :size]
     grey = np.zeros((size, size))
     for x, y in uv:
-        grey = np.maximum(grey, np.hypot(u - x, v - y) < 5)
+        near = np.s_[round(y) - 6 : round(y) + 7, round(x) - 6 : round(x) + 7]
+        grey[near] = np.maximum(grey[near], np.hypot(u[near] - x, v[near] - y) < 5)
     grey = light + contrast * cv2.GaussianBlur(grey, (0, 0), 1.2)
     return np.clip(grey + rng.normal(0, 15, grey.shape), 0, 4095).astype(np.uint16), uv
 

@@ -24,7 +24,7 @@ OPTIONS = {'max_iterations': 2}
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Result folder of fluoroscope a; figures of the report are not drawn."""
-    monkeypatch.setattr(html_report, 'svg_text', lambda figure: '')
+    monkeypatch.setattr(html_report, '_figures', lambda *_: [])
     save_result(tmp_path / 'result', calibrated('a', 6, **OPTIONS))
     request = CalibrationRequest(
         {'a': exposures()['a'][:6]}, rig().phantom, CalibrationOptions(**OPTIONS)

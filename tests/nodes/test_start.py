@@ -22,7 +22,7 @@ NOT_LOADED = {
 # A process forked for each node, from one with what all nodes load.
 CODE = """
 import importlib, os, sys
-import rclpy
+import fluoro_calib_ros.nodes.runtime.main
 
 for node in sys.argv[1:]:
     child = os.fork()

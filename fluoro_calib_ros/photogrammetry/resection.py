@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -191,6 +192,15 @@ def robust_dlt(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.
     xyz (n, 3) in space, or (n, 2) in a plane [mm], and uv (n, 2) [px] of n >= 8 targets. Raises
     DataError if there are too few targets, or if they or their image points are degenerate.
     """
+    points = (np.ascontiguousarray(array, dtype=float) for array in (xyz, uv))
+    return _robust_dlt(xyz.shape[1], *(array.tobytes() for array in points)).copy()
+
+
+@lru_cache(maxsize=256)
+def _robust_dlt(columns: int, xyz_bytes: bytes, uv_bytes: bytes) -> NDArray[np.float64]:
+    """Return `robust_dlt` of the bytes of its arrays: checks and start values need it in turn."""
+    xyz = np.frombuffer(xyz_bytes).reshape(-1, columns)
+    uv = np.frombuffer(uv_bytes).reshape(-1, 2)
     if len(xyz) < MIN_TARGETS:
         raise DataError(f'{too_few(len(xyz), "target")} for a resection, {MIN_TARGETS} are needed')
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)

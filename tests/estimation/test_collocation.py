@@ -103,7 +103,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not 
 SIZE = (1024, 768)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope='module')
 def one_thread():
     """Use one thread, as a calibration does: two are slower for matrices of this size."""
     with threadpool_limits(1):

@@ -68,13 +68,13 @@ def test_arrays_that_would_be_giant_are_not_decompressed(tmp_path):
     path = save_calibration(tmp_path, calibrated('a', 5, model='none').calibrations['a'])
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, content in members.items():
             archive.writestr(name, content)
         with archive.open('train_uv2.npy', 'w', force_zip64=True) as member:
             for _ in range(300):
                 member.write(bytes(2**20))
-    assert os.path.getsize(path) < 2**20
+    assert os.path.getsize(path) < 2**21
     assert 'the limit is' in refused(load_calibration, path)
 
 

@@ -35,7 +35,7 @@ MANY_TARGETS = dict(exposures=4, targets=30)  # eliminates the points
 MANY_EXPOSURES = dict(exposures=14, targets=20)  # eliminates the exposures
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope='module')
 def one_thread():
     """Use one thread, as a calibration does: two are slower for matrices of this size."""
     with threadpool_limits(1):

@@ -26,7 +26,7 @@ SHAPES = [
 ]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope='module')
 def one_thread():
     with threadpool_limits(1):
         yield

@@ -38,7 +38,7 @@ SOURCE = np.array([0.0, -1500.0, 0.0])
 INTERIOR = np.array([511.5, 511.5, 4000.0])
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope='module')
 def one_thread():
     with threadpool_limits(1):
         yield

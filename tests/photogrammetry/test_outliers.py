@@ -27,7 +27,7 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 SHAPE = dict(exposures=10, targets=60, noise_px=0.25)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope='module')
 def one_thread():
     with threadpool_limits(1):
         yield

@@ -44,7 +44,7 @@ SHAPES = [
 SOFT = (0.5, 2e-4)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope='module')
 def one_thread():
     with threadpool_limits(1):
         yield

@@ -441,7 +441,7 @@ def test_projections_are_corrected_to_where_they_come_from(rig):
     _, known = rig
     smooth = pincushion('a', (1024, 1024))
     steep = replace(smooth.model, train_duv=5 * smooth.model.train_duv)
-    calibrations = {name: replace(smooth, fluoroscope=name, model=steep) for name in 'abc'}
+    calibrations = dict.fromkeys('abc', replace(smooth, model=steep))
     distorted = CalibratedRig(known.orientation, calibrations, {})
     points = np.random.default_rng(2).uniform(-110, 110, (400, 3))
     for view, name in enumerate('abc'):

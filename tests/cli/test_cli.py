@@ -254,7 +254,7 @@ def test_calibrate_writes_result_and_calibrations(result):
 @pytest.mark.long
 def test_bag_and_csv_give_the_same_numbers(rig, tmp_path):
     """They agree to the last digit, also in another process with two threads."""
-    more = ('--max-iterations', 1, '--fluoroscopes', 'a', '--model', 'local_linear')
+    more = ('--max-iterations', 1, '--fluoroscopes', 'a', '--model', 'parametric')
     assert run(*calibrate(rig, tmp_path / 'bag', *more)) == 0
     assert run(*calibrate(rig, tmp_path / 'csv', *more, *IMAGE, source='calibration.csv')) == 0
     done = command(

@@ -389,12 +389,12 @@ def radiograph_of_pairs(scatter: float, photons: float = 300) -> tuple[np.ndarra
     away *= RADIUS * rng.uniform(0.8, 1.7, 8)[:, None] / np.linalg.norm(away, axis=1)[:, None]
     uv = np.concatenate([place, place[20:] + away])
     height, width = 5 * PITCH, 6 * PITCH
-    v, u = ((np.mgrid[: FINE * height, : FINE * width] + 0.5) / FINE - 0.5).astype(np.float32)
-    depth = np.zeros(u.shape, np.float32)
+    place = ((np.arange(FINE * width) + 0.5) / FINE - 0.5).astype(np.float32)
+    depth = np.zeros((FINE * height, FINE * width), np.float32)
     for x, y in uv:
-        near = (np.abs(v[:, 0] - y) < RADIUS)[:, None] & (np.abs(u[0] - x) < RADIUS)
-        squared = (u[near] - x) ** 2 + (v[near] - y) ** 2
-        depth[near] += 2 * np.sqrt(np.maximum(RADIUS**2 - squared, 0))
+        us, vs = (slice(*np.searchsorted(place, [c - RADIUS, c + RADIUS])) for c in (x, y))
+        squared = (place[us] - x) ** 2 + (place[vs, None] - y) ** 2
+        depth[vs, us] += 2 * np.sqrt(np.maximum(RADIUS**2 - squared, 0))
     light = photons * (scatter + (1 - scatter) * np.exp(-ABSORBED * depth))
     light = cv2.GaussianBlur(light, (0, 0), FINE * 1.2)
     light = light.reshape(height, FINE, width, FINE).mean(axis=(1, 3))

@@ -32,6 +32,7 @@ gc.disable()
 def pytest_collection_finish() -> None:
     """Re-enable garbage collection, but exempt the tests and modules, which stay in memory."""
     gc.freeze()
+    gc.set_threshold(10_000, 20, 20)  # modules that tests load stay, and take long to traverse
     gc.enable()
 
 

@@ -173,6 +173,15 @@ def one_exposure(seed=0, targets=60):
     )
 
 
+def test_a_projection_that_is_computed_once_belongs_to_each_who_asks():
+    xyz, uv, *_ = one_exposure(0, targets=8)
+    first = robust_dlt(xyz, uv)
+    before = first.copy()
+    first *= 2
+    np.testing.assert_array_equal(robust_dlt(xyz, uv), before)
+    assert not np.array_equal(robust_dlt(xyz, uv + 1), before)
+
+
 @pytest.mark.parametrize('seed', range(5))
 def test_resection_of_exact_data_is_exact(seed):
     """From the minimum number of targets, in any attitude."""

@@ -134,17 +134,28 @@ def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
     chosen = chosen[:: len(chosen) // SAMPLED + 1]
     level = cv2.blur(light, (3, 3)).ravel()[chosen]
     deviation = np.abs(cv2.filter2D(light, cv2.CV_32F, kernel).ravel()[chosen])
+    deviation /= np.sqrt(_seen_by(SECOND, correlation))
+    return Noise(*line_of_variance(level, deviation), correlation)
+
+
+def line_of_variance(
+    level: NDArray[np.floating], deviation: NDArray[np.floating]
+) -> tuple[float, float]:
+    """Return the constant, and the gain, of the variance of deviations (n,) at levels (n,).
+
+    The variance is estimated robustly at pixels of about the same level.
+    """
     parts = np.array_split(np.argsort(level), LEVELS)
     mean = np.array([np.median(level[part]) for part in parts])
     variance = np.array([(1.4826 * np.median(deviation[part])) ** 2 for part in parts])
-    variance = np.maximum(variance / _seen_by(SECOND, correlation), MIN_VARIANCE)
+    variance = np.maximum(variance, MIN_VARIANCE)
     weight = 1 / variance
     gain = constant = 0.0
     for _ in range(3):
         rows = np.column_stack([np.ones_like(mean), mean]) * weight[:, None]
         (constant, gain), _ = nnls(rows, variance * weight)
         weight = 1 / np.maximum(constant + gain * mean, MIN_VARIANCE)
-    return Noise(max(constant, MIN_VARIANCE), gain, correlation)
+    return max(constant, MIN_VARIANCE), gain
 
 
 def _seen_by(kernel: NDArray[np.float64], correlation: NDArray[np.float64]) -> float:

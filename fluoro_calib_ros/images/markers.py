@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..findings import Finding, Kind
 from ..options import option, validate_options
-from .marker_fit import MarkerMeasurement
+from .marker_fit import MarkerMeasurement, noise_of_markers
 from .marker_intensity import (
     NOWHERE_PX,
     FilteredImage,
@@ -360,6 +360,9 @@ class MarkerTracker:
         if self.first is not None:
             self.first = replace(self.first, filtered=None)  # release a large image
         start = learn_start(filtered, self.target_id, places)
+        seen = start.states.motion.uv[start.states.unseen == 0]
+        windows = LightWindows(image, start.look)
+        start = replace(start, noise=noise_of_markers(windows, seen, start.profile, start.noise))
         for row in np.flatnonzero(np.isnan(places[:, 0])).tolist():
             start.states.forget(row, self.options.lost_after + 1)
         return _Followed.begun(start, self.target_id, self.options)

@@ -50,7 +50,8 @@ BORDER = 3  # width of the edge of a window that is not searched, in scales of t
 class Shadows:
     """Round shadows: places (n, 2) [px] to about 0.1 px, and strengths (n,).
 
-    The strength is the response over the light around the shadow.
+    The strength is the response over the light around the shadow, less in the dark, as far as it
+    has more noise there.
     """
 
     uv: NDArray[np.float64]
@@ -291,8 +292,13 @@ class _Typical:
 
     @classmethod
     def strongest(cls, light: FilteredLight, count: int) -> _Typical:
-        """Return the median of the `count` strongest maxima."""
-        values = np.sort(light.relative[light.maxima])[::-1][: max(count, 3)]
+        """Return the median of the `count` maxima in the field that noise explains least."""
+        row, column = light.maxima
+        inside = light.field[row, column]
+        row, column = row[inside], column[inside]
+        values = light.relative[row, column]
+        above = values / _rise(max(light.usual, 1.0), light.around[row, column])
+        values = values[np.argsort(-above, kind='stable')[: max(count, 3)]]
         return cls(light, float(np.median(values)) if len(values) else 0.0)
 
     @property
@@ -342,14 +348,15 @@ def _find_shadows(look: MarkerLook, light: FilteredLight) -> Shadows:
     inside = (row > 0) & (row < height - 1) & (column > 0) & (column < width - 1)
     rows = np.flatnonzero(strong & inside & look.field[row, column])
     row, column = row[rows], column[rows]
-    clear = light.relative[row, column] >= _floor(look, light.around[row, column])
-    row, column = row[clear], column[clear]
+    rise = _rise(look.light, light.around[row, column])
+    clear = light.relative[row, column] >= look.floor * rise
+    row, column, rise = row[clear], column[clear], rise[clear]
     response = light.relative
     at = response[row, column]
     # Interpolate to a part of a pixel.
     u = column + vertex(response[row, column - 1], at, response[row, column + 1])
     v = row + vertex(response[row - 1, column], at, response[row + 1, column])
-    return Shadows(np.column_stack([u, v]), at)
+    return Shadows(np.column_stack([u, v]), at / rise)
 
 
 def search_windows(
@@ -380,10 +387,10 @@ def _square(half: int) -> NDArray[np.int64]:
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
-def _floor(look: MarkerLook, around: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the relative response below which noise is likely; it increases in the dark."""
-    light = np.maximum(around, 1e-3 * look.light)
-    return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
+def _rise(usual: float, around: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return how much larger (n,) than at the usual light the noise of relative responses is."""
+    light = np.maximum(around, 1e-3 * usual)
+    return np.asarray(np.sqrt(np.maximum(usual / light, 1.0)))
 
 
 MIN_DENSITY = 2e-6  # least density of false shadows [1/px^2]

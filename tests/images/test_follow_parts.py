@@ -24,7 +24,12 @@ from fluoro_calib_ros.images.fine_grid import Absorbers, FineGrid
 from fluoro_calib_ros.images.lattice import GridPose
 from fluoro_calib_ros.images.light import LAGS, Light, Noise
 from fluoro_calib_ros.images.marker_fit import MarkerGuess, fit_markers
-from fluoro_calib_ros.images.marker_intensity import LightWindows, _floor
+from fluoro_calib_ros.images.marker_intensity import (
+    FilteredImage,
+    LightWindows,
+    _rise,
+    first_shadows,
+)
 from fluoro_calib_ros.images.marker_motion import MarkerStates, MeasuredMarkers, Motion
 from fluoro_calib_ros.images.marker_points import ShadowPoints
 from fluoro_calib_ros.images.marker_rays import MarkerBodies
@@ -156,11 +161,24 @@ def test_light_is_blurred_behind_two_beads_that_move(blur, place):
 # ---- responses
 
 
-def test_floor_of_a_response_grows_in_the_dark():
-    look = Fake(floor=0.2, light=1000.0)
+def test_noise_of_a_response_grows_in_the_dark():
     around = np.array([1000.0, 250.0, 4000.0, 0.0])
-    expected = [0.2, 0.4, 0.2, 0.2 * np.sqrt(1000)]
-    np.testing.assert_allclose(_floor(look, around), expected)
+    np.testing.assert_allclose(_rise(1000.0, around), [1, 2, 1, np.sqrt(1000)])
+
+
+def test_noise_in_the_dark_does_not_determine_how_markers_look():
+    """Relative to hardly any light, a grey value more or less is a strong response."""
+    rng = np.random.default_rng(5)
+    image = np.full((300, 300), 200.0)
+    image[:, 200:] = 0.3
+    uv = np.stack(np.meshgrid([30.0, 70, 110, 150], [50.0, 150, 250]), axis=-1).reshape(-1, 2)
+    v, u = np.mgrid[:300, :300]
+    for x, y in uv:
+        image *= 1 - 0.4 * np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 1.5**2)
+    image = rng.poisson(image).astype(np.uint8)
+    shadows = first_shadows(FilteredImage(image).of_scale(1.5), len(uv)).strongest(len(uv))
+    distance = np.linalg.norm(shadows.uv[:, None] - uv, axis=2)
+    assert (distance.min(axis=0) < 1).all()
 
 
 def test_voters_are_counted_where_they_are_found_in_the_field():
@@ -340,7 +358,21 @@ def test_expected_fits_by_chance_are_those_of_points_anywhere():
     ring = density * 2 * np.pi * (d / 2) * 0.8**2
     ball = density * 4 / 3 * np.pi * 0.4**3
     expected = comb(6, 5) * 30 * shell * ring * ball**2
-    assert marker_ids._by_chance(body, fit, xyz) == pytest.approx(expected)
+    own = np.array([[200.0, 0, 0]] * 5)  # no other points are around
+    assert marker_ids._by_chance(body, fit, xyz, own) == pytest.approx(expected)
+
+
+def test_fits_among_dense_points_are_as_likely_by_chance_as_among_so_many_anywhere():
+    """Letters of a label are close together: four of them resemble a body by chance."""
+    body = Body('bone', np.arange(4), RNG.normal(0, 12, (4, 3)), np.full(4, 0.1))
+    extent = pdist(body.xyz_mm).max()
+    label = RNG.uniform(-0.3, 0.3, (30, 3)) * extent
+    far = np.array([[-900.0, -900, -900], [900, 900, 900]])
+    fit = marker_ids._Fit(np.arange(4), 0.2, 4.0)
+    found = marker_ids._by_chance(body, fit, np.concatenate([label, far]), label[:4])
+    volume = 4 / 3 * np.pi * extent**3
+    anywhere = marker_ids._by_chance(body, fit, far, label[:4]) / 2
+    assert found / 32 == pytest.approx(anywhere * (26 / volume / (2 / 1800**3)) ** 3)
 
 
 def searched(body, xyz, sd=0.1):

@@ -107,11 +107,14 @@ def identify_markers(
         check_image(images[name], calibrations[name].image_size)
     search = _ImageSearch(images, rig, bodies)
     # Other round objects in the images may be larger and more distinct. If there are many bodies,
-    # perhaps only one is visible.
+    # perhaps only one is visible. White letters may make bright markers likely.
     count = sum(len(body.target_id) for body in bodies)
-    for scale, strongest in product(MARKER_SCALES[:3], (count, MIN_MEMBERS)):
-        if strongest == count or len(search.missing) == len(bodies):
-            search.look(scale, strongest)
+    for bright, scale, strongest in product(
+        (None, False, True), MARKER_SCALES[:3], (count, MIN_MEMBERS)
+    ):
+        none_is_found = len(search.missing) == len(bodies)
+        if none_is_found or (bright is None and strongest == count):
+            search.look(scale, strongest, bright)
         if not search.missing:
             break
     return search.markers()
@@ -130,12 +133,15 @@ class _ImageSearch:
         self._found: dict[str, list[FirstMarkers]] = {}
         self._reason: DataError | None = None
 
-    def look(self, scale: float, strongest: int) -> None:
-        """Search for the missing bodies; the strongest shadows of a size determine their look."""
+    def look(self, scale: float, strongest: int, bright: bool | None = None) -> None:
+        """Search for the missing bodies; the strongest shadows of a size determine their look.
+
+        bright: whether markers are bright, None for what is likely in each image.
+        """
         try:
             with ThreadPoolExecutor(len(self._images)) as threads:
                 results = threads.map(
-                    _shadows_of, self._images.values(), repeat((scale, strongest))
+                    _shadows_of, self._images.values(), repeat((scale, strongest, bright))
                 )
                 shadows = list(results)
         except DataError as error:
@@ -165,10 +171,15 @@ class _ImageSearch:
         }
 
 
-def _shadows_of(image: FilteredImage, kind: tuple[float, int]) -> np.ndarray:
-    """Return places (k, 2) of shadows; kind: their scale and number. Raises DataError."""
-    scale, strongest = kind
-    return first_shadows(image.of_scale(scale), strongest).strongest(MAX_SHADOWS).uv
+def _shadows_of(image: FilteredImage, kind: tuple[float, int, bool | None]) -> np.ndarray:
+    """Return places (k, 2) of shadows; kind: scale, number, whether they are bright.
+
+    Raises DataError.
+    """
+    scale, strongest, bright = kind
+    lights = image.of_scale(scale)
+    chosen = lights if bright is None else lights[bright : bright + 1]
+    return first_shadows(chosen, strongest).strongest(MAX_SHADOWS).uv
 
 
 def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:

@@ -42,6 +42,7 @@ MIN_SNR = 4.5  # least response, over the noise of the response
 SHARE = 0.35  # least response of a marker, over that to a typical marker
 BACKGROUND_PX = 6  # half the width of the box whose mean is the light around a pixel
 SAMPLED = 4  # step of rows and columns when pixels are subsampled
+SPARSE = 8  # step of the pixels whose median, of five by five, is the light of wide surroundings
 SAME_PX = 1.0  # distance between maxima below which they are one shadow
 BORDER = 3  # width of the edge of a window that is not searched, in scales of the blur
 
@@ -99,6 +100,8 @@ class FilteredLight:
     light: NDArray[np.float32]
     response: NDArray[np.float32]
     around: NDArray[np.float32]  # mean of the surrounding light
+    # Median light (h / SPARSE, w / SPARSE) of wide surroundings, None for windows of an image.
+    wide: NDArray[np.float32] | None = None
 
     @cached_property
     def relative(self) -> NDArray[np.float32]:
@@ -121,12 +124,21 @@ class FilteredLight:
 
     @cached_property
     def maxima(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns (k,) of the local maxima of the relative response."""
+        """Rows and columns (k,) of the local maxima of the relative response.
+
+        In a whole image, a shadow is darker than its wide surroundings, unlike the gaps of bright
+        letters.
+        """
         kernel = np.ones((2 * max(1, round(self.scale)) + 1,) * 2, np.uint8)
         dilated = cv2.dilate(self.relative, kernel)
         largest = self.relative >= dilated
         largest &= self.relative > 0
         row, column = np.divmod(np.flatnonzero(largest), largest.shape[1])
+        if self.wide is not None:
+            # The response is less than the depth of a shadow.
+            least = self.wide[row // SPARSE, column // SPARSE] - self.response[row, column]
+            dark = self.light[row, column] < least
+            row, column = row[dark], column[dark]
         return row, column
 
     @cached_property
@@ -153,7 +165,9 @@ class FilteredImage:
         grey = image.astype(np.float32)
         around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
         self._white = white_level(image)
-        self._lights = (grey, around), (self._white - grey, self._white - around)
+        wide = cv2.medianBlur(np.ascontiguousarray(grey[::SPARSE, ::SPARSE]), 5)
+        dark = grey, around, wide
+        self._lights = dark, tuple(self._white - values for values in dark)
 
     def of_scale(self, scale: float) -> tuple[FilteredLight, FilteredLight]:
         """Return the image filtered for dark shadows and for bright shadows."""
@@ -161,8 +175,8 @@ class FilteredImage:
             dark, bright = self._lights
             filtered = responses(dark[0], scale)
             self._by_scale[scale] = (
-                FilteredLight(scale, None, dark[0], filtered[0], dark[1]),
-                FilteredLight(scale, self._white, bright[0], filtered[1], bright[1]),
+                FilteredLight(scale, None, dark[0], filtered[0], *dark[1:]),
+                FilteredLight(scale, self._white, bright[0], filtered[1], *bright[1:]),
             )
         return self._by_scale[scale]
 

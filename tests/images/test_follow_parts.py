@@ -5,7 +5,7 @@
 
 import functools
 from dataclasses import replace
-from itertools import permutations
+from itertools import permutations, product
 from math import comb
 from types import SimpleNamespace as Fake
 
@@ -660,17 +660,20 @@ def test_doubtful_ids_that_fit_a_shape_support_each_other(
     assert found.tolist() == (agrees if is_used else agrees & ~doubtful).tolist()
 
 
-@pytest.mark.parametrize('needed', [1, 3, 9])
+@pytest.mark.parametrize('needed', [1, 3, 9, 16, 20])
 def test_sizes_of_shadows_are_tried_until_all_bodies_are_found(monkeypatch, needed):
-    """Each size is tried with as many of the strongest shadows as markers, then as one body."""
+    """Each size is tried with as many of the strongest shadows as markers, then as one body.
+
+    It is tried first with the likely polarity of each image, then with dark and bright shadows.
+    """
     looks = []
 
     class Search:
         def __init__(self, images, rig, bodies):
             self.missing = list(bodies)
 
-        def look(self, scale, strongest):
-            looks.append((scale, strongest))
+        def look(self, scale, strongest, bright):
+            looks.append((bright, scale, strongest))
             if len(looks) == needed:
                 self.missing = []
 
@@ -687,8 +690,8 @@ def test_sizes_of_shadows_are_tried_until_all_bodies_are_found(monkeypatch, need
     calibrations = dict.fromkeys('ab', Fake(image_size=(9, 9)))
     images = dict.fromkeys('ab')
     assert marker_ids.identify_markers(images, calibrations, rig, bodies) == 'found'
-    every = [(scale, count) for scale in marker_ids.MARKER_SCALES[:3] for count in (8, 4)]
-    assert looks == every[: min(needed, 6)]
+    every = list(product((None, False, True), marker_ids.MARKER_SCALES[:3], (8, 4)))
+    assert looks == every[: min(needed, 18)]
     with pytest.raises(DataError, match='no body with 4 markers'):
         marker_ids.identify_markers(images, calibrations, rig, [])
 

@@ -740,6 +740,24 @@ def test_bodies_with_markers_of_different_sizes_are_found_together():
         assert np.abs(found[name].uv - np.concatenate(uv)).max() < 1.0
 
 
+def test_a_body_is_found_in_images_with_white_labels():
+    """Letters look like bright markers, and the gaps between them like dark ones."""
+    xyz = np.random.default_rng(2478).uniform(-12, 12, (6, 3))
+    body = Body('bone', np.arange(11, 17), xyz, np.full(6, 0.03))
+    calibrations, orientation = calibration()
+    places = {f.name: f.ideal(xyz) for f in rig().fluoroscopes}
+    images = {}
+    for name, uv in places.items():
+        image = drawn([(uv, 1.2)], SIZE)
+        for row, text in ((24, 'PATIENT 4711'), (SIZE - 12, 'L 70 kV 12:30')):
+            cv2.putText(image, text, (6, row), cv2.FONT_HERSHEY_SIMPLEX, 0.8, 255, 2, cv2.LINE_AA)
+        images[name] = image
+    found = identify_markers(images, calibrations, orientation, [body])
+    for name, uv in places.items():
+        assert found[name].target_id.tolist() == list(range(11, 17))
+        assert np.abs(found[name].uv - uv).max() < 1.0
+
+
 def test_bodies_that_an_impact_moves_are_found_again_and_no_wrong_id_is_left():
     """Both bodies move by 20 px between two images; afterwards a view misses an image."""
     rng = np.random.default_rng(2477)

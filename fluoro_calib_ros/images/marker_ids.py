@@ -231,8 +231,7 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
             f'body {body.name}: only {count} of {len(body.target_id)} markers fit its shape '
             'in this exposure'
         )
-    own = points.xyz[best.point[best.point >= 0]]
-    if _by_chance(body, best, points.xyz[free], own) > MAX_CHANCE:
+    if _by_chance(body, best, points.xyz[free], _around(body, best, points, free)) > MAX_CHANCE:
         raise DataError(
             f'body {body.name}: {best.count} of {len(body.target_id)} markers fit its shape in '
             f'this exposure, but so may others of {np.count_nonzero(free)} points by chance'
@@ -248,25 +247,31 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
     return best
 
 
-def _by_chance(body: Body, fit: _Fit, xyz: NDArray[np.float64], own: NDArray[np.float64]) -> float:
+def _around(body: Body, fit: _Fit, points: ShadowPoints, free: NDArray[np.bool_]) -> float:
+    """Return the density of points around a fit [1/mm^3], without those of its own shadows."""
+    own = fit.point[fit.point >= 0]
+    others = free.copy()
+    for column, used in zip(points.shadow.T, points.shadow[own].T):
+        others &= ~np.isin(column, used[used >= 0])
+    extent = float(pdist(body.xyz_mm[fit.point >= 0]).max())
+    away = np.linalg.norm(points.xyz[others] - points.xyz[own].mean(axis=0), axis=1)
+    return np.count_nonzero(away < extent) / (4 / 3 * np.pi * extent**3)
+
+
+def _by_chance(body: Body, fit: _Fit, xyz: NDArray[np.float64], around: float) -> float:
     """Return the expected number of equally good fits among as many random points.
 
-    The points are as dense as those of xyz (n, 3), or as those between which the fit lies, if they
-    are denser, like those of letters; own: (k, 3), the points of the fit. The second member is on
-    a sphere about the first, the third on a circle, and each further member at a place that these
-    determine, all to within twice the RMS of the fit (Grimson and Huttenlocher, "On the
-    verification of hypothesized matches in model-based recognition", IEEE PAMI 13, 1991; the
-    number is that of Desolneux, Moisan and Morel, "From Gestalt Theory to Image Analysis", 2008).
+    The points are as dense as those of xyz (n, 3), or as those around the fit [1/mm^3], if they
+    are denser, like those of letters. The second member is on a sphere about the first, the third
+    on a circle, and each further member at a place that these determine, all to within twice the
+    RMS of the fit (Grimson and Huttenlocher, "On the verification of hypothesized matches in
+    model-based recognition", IEEE PAMI 13, 1991; the number is that of Desolneux, Moisan and
+    Morel, "From Gestalt Theory to Image Analysis", 2008).
     """
     reach = 2 * fit.rms_mm
-    distances = pdist(body.xyz_mm[fit.point >= 0])
-    distance = float(distances.mean())
-    extent = float(distances.max())
-    around = np.linalg.norm(xyz - own.mean(axis=0), axis=1) < extent
-    density = max(  # points per mm^3
-        len(xyz) / max(float(np.prod(np.ptp(xyz, axis=0))), 1.0),
-        (np.count_nonzero(around) - len(own)) / (4 / 3 * np.pi * extent**3),
-    )
+    distance = float(pdist(body.xyz_mm[fit.point >= 0]).mean())
+    anywhere = len(xyz) / max(float(np.prod(np.ptp(xyz, axis=0))), 1.0)
+    density = max(anywhere, around)  # points per mm^3
     on_sphere = density * 4 * np.pi * distance**2 * 2 * reach
     on_circle = density * np.pi * distance * (2 * reach) ** 2  # radius: half the distance
     at_place = density * 4 / 3 * np.pi * reach**3

@@ -358,21 +358,24 @@ def test_expected_fits_by_chance_are_those_of_points_anywhere():
     ring = density * 2 * np.pi * (d / 2) * 0.8**2
     ball = density * 4 / 3 * np.pi * 0.4**3
     expected = comb(6, 5) * 30 * shell * ring * ball**2
-    own = np.array([[200.0, 0, 0]] * 5)  # no other points are around
-    assert marker_ids._by_chance(body, fit, xyz, own) == pytest.approx(expected)
+    assert marker_ids._by_chance(body, fit, xyz, density / 2) == pytest.approx(expected)
+    # A sphere, a circle and two balls.
+    assert marker_ids._by_chance(body, fit, xyz, 3 * density) == pytest.approx(3**4 * expected)
 
 
-def test_fits_among_dense_points_are_as_likely_by_chance_as_among_so_many_anywhere():
+def test_points_around_a_fit_are_those_of_other_shadows():
     """Letters of a label are close together: four of them resemble a body by chance."""
     body = Body('bone', np.arange(4), RNG.normal(0, 12, (4, 3)), np.full(4, 0.1))
     extent = pdist(body.xyz_mm).max()
-    label = RNG.uniform(-0.3, 0.3, (30, 3)) * extent
     far = np.array([[-900.0, -900, -900], [900, 900, 900]])
+    xyz = np.concatenate([RNG.uniform(-0.3, 0.3, (30, 3)) * extent, far])
+    shadow = np.tile(np.arange(32)[:, None], 2)
+    shadow[4:9, 1] = 0  # points of a shadow of the fit
+    points = ShadowPoints(xyz, np.full(32, 0.01), shadow)
+    free = np.arange(32) != 9
     fit = marker_ids._Fit(np.arange(4), 0.2, 4.0)
-    found = marker_ids._by_chance(body, fit, np.concatenate([label, far]), label[:4])
-    volume = 4 / 3 * np.pi * extent**3
-    anywhere = marker_ids._by_chance(body, fit, far, label[:4]) / 2
-    assert found / 32 == pytest.approx(anywhere * (26 / volume / (2 / 1800**3)) ** 3)
+    density = marker_ids._around(body, fit, points, free)
+    assert density == pytest.approx(20 / (4 / 3 * np.pi * extent**3))
 
 
 def searched(body, xyz, sd=0.1):

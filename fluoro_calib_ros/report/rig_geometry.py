@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..exposures.phantom import Phantom
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -124,7 +123,7 @@ def uncalibrated_share(calibration: FluoroscopeCalibration) -> float:
     """Return the fraction of pixels outside the calibrated area, 0 to 1."""
     ticks = ((np.arange(GRID) + 0.5) / GRID * side - 0.5 for side in calibration.image_size)
     uv = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 2)
-    return float(np.mean(calibration.correct(uv).status != CorrectionStatus.OK))
+    return float(np.mean(calibration.model.outside(uv)))
 
 
 def drawing(

@@ -257,8 +257,8 @@ def lattice(count: int, missing: int, pitch: float = 16.0) -> Callable[..., Targ
 
     def drawn(rng: np.random.Generator) -> Target:
         places = np.stack(np.meshgrid(*3 * [np.arange(count)], indexing='ij'), axis=-1)
-        xyz = pitch * (places.reshape(-1, 3) - (count - 1) / 2)
-        xyz = np.delete(xyz, rng.permutation(len(xyz))[:missing], axis=0)
+        kept = np.sort(rng.permutation(count**3)[missing:])
+        xyz = pitch * (places.reshape(-1, 3)[kept].astype(np.float64) - (count - 1) / 2)
         return Target(xyz, np.full(len(xyz), 3.0))
 
     return drawn

@@ -382,7 +382,7 @@ def saved_note():
 
 
 def ambiguous():
-    first, rival = (Fake(score=50.0, scale_px=1.0, bead=range(n)) for n in (60, 59))
+    first, rival = (Fake(score=50.0, scale_px=1.0, bead=range(n), against=0) for n in (60, 59))
     with mock.patch.multiple(
         matching,
         _climbed=lambda *_: (first, [rival]),

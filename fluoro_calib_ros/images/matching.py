@@ -206,7 +206,8 @@ def _could_be(more: float, beads: int, against: float) -> bool:
     against : float
         Number of contradictions to the best pose.
     """
-    return bool(more * np.log(beads / (against + 1)) < LIKELIER)
+    log_odds = np.log(max(beads / (against + 1), 1.0))
+    return bool(more * log_odds < LIKELIER)
 
 
 def _ambiguous(best: Match, other: Match) -> DataError:

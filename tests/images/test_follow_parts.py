@@ -483,6 +483,8 @@ def test_extent_of_a_phantom_does_not_depend_on_its_origin():
 def test_a_pose_could_be_by_what_speaks_against_it(more, could):
     # A contradiction has a probability of a tenth: 10 ** -5 is less than exp(-10).
     assert matching._could_be(more, 110, 10) is could
+    # If anything may be missing, nothing is certain.
+    assert matching._could_be(10 * more - 20, 10, 40)
 
 
 def grid_match(monkeypatch, scales, regular=False, by_size=None):

@@ -114,7 +114,7 @@ class PhantomModel:
     @cached_property
     def symmetries(self) -> tuple[Symmetry, ...]:
         """Motions that move many beads close to others, computed on first use."""
-        return symmetries_of(self.xyz)
+        return symmetries_of(self.xyz, self.triples)
 
     @cached_property
     def triples(self) -> Triples:

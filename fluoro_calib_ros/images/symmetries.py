@@ -19,13 +19,12 @@ from scipy.spatial import cKDTree
 from ..bodies.body import fitted_pose
 from ..photogrammetry.rotations import rotation_angle
 from .lattice import REACH
+from .pose_search import Triples
 from .view import View
 
-NEIGHBOURS = 8  # of a bead, which form triples with it
 # Beads whose triples are superimposed. A motion is missed if all of them, or their neighbours, are
 # moved to where no bead is.
 STARTS = 12
-MIN_SINE = 0.3  # least sine of the angle between the sides of a triple
 MIN_SHARE = 0.4  # least share of the beads that a symmetry moves close to a bead
 # Motions that are tried, those first that move the middle of the phantom least: they overlap most.
 TRIED = 300
@@ -60,11 +59,11 @@ class Symmetry:
         )
 
 
-def symmetries_of(xyz: NDArray[np.float64]) -> tuple[Symmetry, ...]:
+def symmetries_of(xyz: NDArray[np.float64], triples: Triples) -> tuple[Symmetry, ...]:
     """Return the symmetries of beads (n, 3) [mm], those with the largest share first."""
     tree = cKDTree(xyz)
     reach = REACH * float(np.median(tree.query(xyz, k=[2])[0]))
-    rotation, shift = _distinct(*_motions(xyz, tree, reach), xyz=xyz, reach=reach)
+    rotation, shift = _distinct(*_motions(xyz, triples, reach), xyz=xyz, reach=reach)
     sample = np.random.default_rng(0).permutation(xyz)[:SAMPLE]
     for limit in (2 * reach, reach):
         away, row = tree.query(sample @ np.swapaxes(rotation, 1, 2) + shift[:, None])
@@ -86,27 +85,21 @@ def symmetries_of(xyz: NDArray[np.float64]) -> tuple[Symmetry, ...]:
 
 
 def _motions(
-    xyz: NDArray[np.float64], tree: cKDTree, reach: float
+    xyz: NDArray[np.float64], triples: Triples, reach: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotations (m, 3, 3) and shifts (m, 3) that superimpose congruent triples of beads."""
-    _, near = tree.query(xyz, k=min(NEIGHBOURS + 1, len(xyz)))
-    first, second = np.nonzero(~np.eye(near.shape[1] - 1, dtype=bool))
-    bead = np.repeat(np.arange(len(xyz)), len(first))
-    a = xyz[near[:, 1 + first].ravel()] - xyz[bead]
-    b = xyz[near[:, 1 + second].ravel()] - xyz[bead]
-    sides = np.stack([np.linalg.norm(side, axis=1) for side in (a, b, b - a)], axis=1)
-    across = np.linalg.norm(np.cross(a, b), axis=1)
-    good = np.flatnonzero(across > MIN_SINE * sides[:, 0] * sides[:, 1])
-    bead, sides = bead[good], sides[good]
-    axes = _axes(a[good], b[good])
+    a, b = triples.sides[:, 0], triples.sides[:, 1]
+    first = triples.bead[:, 0]
+    lengths = np.stack([np.linalg.norm(side, axis=1) for side in (a, b, b - a)], axis=1)
+    axes = _axes(a, b)
     starts = np.random.default_rng(0).permutation(len(xyz))[:STARTS]
     rotations, shifts = [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
-    for start in starts[np.isin(starts, bead)]:
-        triple = np.flatnonzero(bead == start)[0]
-        congruent = np.flatnonzero((np.abs(sides - sides[triple]) < reach).all(axis=1))
+    for start in starts[np.isin(starts, first)]:
+        triple = np.flatnonzero(first == start)[0]
+        congruent = np.flatnonzero((np.abs(lengths - lengths[triple]) < reach).all(axis=1))
         rotation = axes[congruent] @ axes[triple].T
         rotations.append(rotation)
-        shifts.append(xyz[bead[congruent]] - rotation @ xyz[start])
+        shifts.append(xyz[first[congruent]] - rotation @ xyz[start])
     return np.concatenate(rotations), np.concatenate(shifts)
 
 

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.images.symmetries import MIN_SHARE, Symmetry, symmetries_of
+from fluoro_calib_ros.images.matching import PhantomModel
+from fluoro_calib_ros.images.symmetries import MIN_SHARE, Symmetry
 from fluoro_calib_ros.images.view import Lens, View, exponents
 
 TURN = Rotation.from_rotvec([0.2, 0.5, -0.1])
@@ -33,6 +34,10 @@ def helix(count, turns):
     return np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), 100 * share])
 
 
+def found_in(xyz):
+    return PhantomModel.of(xyz).symmetries
+
+
 def is_among(found, rotation, shift):
     """Return whether a motion is one of the symmetries, with a tolerance of 0.5 mm."""
     return any(
@@ -44,7 +49,7 @@ def is_among(found, rotation, shift):
 def test_symmetries_move_beads_to_beads():
     """A box of beads is symmetric about all its axes and by its steps."""
     xyz = lattice(4, 3, 3)
-    found = symmetries_of(xyz)
+    found = found_in(xyz)
     complete = [one for one in found if one.share == 1]
     # All rotations of a square prism but the identity.
     assert len(complete) == 7
@@ -63,7 +68,7 @@ def test_symmetries_move_beads_to_beads():
 
 @pytest.mark.parametrize('count', [7, 9, 12])
 def test_a_ring_is_turned_by_each_of_its_steps(count):
-    found = symmetries_of(np.concatenate([ring(count, -30), ring(count, 30)]))
+    found = found_in(np.concatenate([ring(count, -30), ring(count, 30)]))
     for number in range(1, count):
         turn = Rotation.from_euler('z', 360 / count * number, degrees=True).as_matrix()
         assert is_among(found, turn, np.zeros(3))
@@ -71,7 +76,7 @@ def test_a_ring_is_turned_by_each_of_its_steps(count):
 
 def test_a_helix_is_screwed_by_its_steps_also_where_beads_are_missing():
     xyz = helix(60, 3.3)[np.sort(np.random.default_rng(1).permutation(60)[10:])]
-    found = symmetries_of(xyz)
+    found = found_in(xyz)
     for number in (-3, -2, -1, 1, 2, 3):
         turn = Rotation.from_euler('z', 360 * 3.3 / 59 * number, degrees=True).as_matrix()
         assert is_among(found, turn, [0, 0, 100 / 59 * number])
@@ -79,9 +84,9 @@ def test_a_helix_is_screwed_by_its_steps_also_where_beads_are_missing():
 
 def test_beads_that_are_made_by_hand_are_nearly_symmetric():
     xyz = lattice(4, 4, 4, 16.0)
-    found = symmetries_of(xyz + np.random.default_rng(2).normal(0, 0.8, xyz.shape))
+    found = found_in(xyz + np.random.default_rng(2).normal(0, 0.8, xyz.shape))
     assert sum(one.share > 0.9 for one in found) >= 23
-    assert symmetries_of(np.random.default_rng(3).uniform(-50, 50, (36, 3))) == ()
+    assert found_in(np.random.default_rng(3).uniform(-50, 50, (36, 3))) == ()
 
 
 def test_a_turned_view_sees_the_moved_phantom_as_the_first_one_sees_the_phantom():

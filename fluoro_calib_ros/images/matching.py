@@ -59,12 +59,17 @@ FITTED = 12  # number of ways to fit a grid to detections; a hexagonal grid has 
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
 AGREED = 3  # matches of the same pose after which the search ends if the pose is evident
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes distinguish beads
-LIKELIER = 10.0  # least lead in log-likelihood of a pose over any other
+# Least lead in log-likelihood of a pose over any other: one image in ten thousand may be mistaken.
+LIKELIER = float(np.log(1e4))
 SIZE_TAIL = 3.0  # residual from which a response is an outlier [standard deviations]
 SIZE_NEIGHBOURS = 12  # neighbours from which the usual response is estimated
-# Bounds of the slope of log response over log radius r. A disc has r^2 exp(-r^2 / 2 s^2) at a
-# scale s, where r < 1.2 s; a small sphere has its thickness as an additional factor.
-SIZE_SLOPES = (0.5, 3.0)
+# Length of the mean direction to the neighbours of a bead from which it is at the border: on a
+# straight border it is 2 / pi, and less than 0.2 two rows further inside.
+AT_BORDER = 0.4
+# Least and largest slope of log response over log radius r, and number of slopes that are tried. A
+# disc has r^2 exp(-r^2 / 2 s^2) at a scale s, where r < 1.2 s; a small sphere has its thickness as
+# an additional factor.
+SIZE_SLOPES = (0.5, 3.0, 11)
 CLOSER = 2.0  # ratio of the residuals of two poses that decides between them
 SCALE_BY_SIZE = (0.55, 1.6)  # ratio of a bead's image to its diameter, with the blur
 
@@ -332,27 +337,43 @@ def _likelihood_of_sizes(
 ) -> float:
     """Return the log-likelihood of log responses (n,) to shadows of log sizes (n,) at uv (n, 2).
 
-    A response is linear in the size, and changes slowly across the image. Its scatter is that of
-    the beads around: it is larger at the edge of a sheet, so that a mark elsewhere stands out.
-    Responses of beads that overlap or that lie before an edge are outliers, with any residual up
+    A response is linear in the size, with the likeliest slope, and changes slowly across the
+    image. Responses of beads that overlap or lie before an edge are outliers, with any residual up
     to the largest. The probability of an outlier is that among the beads around, one of which
     stands for the whole image.
     """
-    _, near = cKDTree(uv).query(uv, k=min(SIZE_NEIGHBOURS + 1, len(uv)))
-    x = size - size[near].mean(axis=1)
-    y = response - response[near].mean(axis=1)
-    slope = np.clip(float(x @ y) / max(float(x @ x), 1e-12), *SIZE_SLOPES)
-    level = response - slope * size
-    local_level = np.median(level[near], axis=1)
-    scatter = 1.4826 * np.median(np.abs(level[near] - local_level[:, None]), axis=1)
-    scatter = np.maximum(np.maximum(scatter, np.median(scatter)), 1e-6)
-    residual = np.abs(level - local_level) / scatter
-    outlier = residual > SIZE_TAIL
-    usual = (np.count_nonzero(outlier) + 1) / (len(uv) + 1)
-    share = (np.sum(outlier[near[:, 1:]], axis=1) + usual) / near.shape[1]
-    normal = np.exp(-0.5 * residual**2) / np.sqrt(2 * np.pi)
-    uniform = 0.5 / max(float(residual.max()), SIZE_TAIL)
-    return float(np.sum(np.log(((1 - share) * normal + share * uniform) / scatter)))
+    near = _neighbours(uv)
+    likelihoods = []
+    for slope in np.linspace(*SIZE_SLOPES):
+        level = response - slope * size
+        local_level = np.median(level[near], axis=1)
+        scatter = 1.4826 * np.median(np.abs(level[near] - local_level[:, None]), axis=1)
+        scatter = np.maximum(np.maximum(scatter, np.median(scatter)), 1e-6)
+        residual = np.abs(level - local_level) / scatter
+        outlier = residual > SIZE_TAIL
+        usual = (np.count_nonzero(outlier) + 1) / (len(uv) + 1)
+        share = (np.sum(outlier[near[:, 1:]], axis=1) + usual) / near.shape[1]
+        normal = np.exp(-0.5 * residual**2) / np.sqrt(2 * np.pi)
+        uniform = 0.5 / max(float(residual.max()), SIZE_TAIL)
+        likelihoods.append(np.sum(np.log(((1 - share) * normal + share * uniform) / scatter)))
+    return float(max(likelihoods))
+
+
+def _neighbours(uv: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return rows (n, k) of each bead (n, 2) and the nearest ones in a similar place.
+
+    At the border of the phantom, as at that of a sheet, responses differ from those inside.
+    """
+    count = min(SIZE_NEIGHBOURS + 1, len(uv))
+    _, near = cKDTree(uv).query(uv, k=count)
+    offset = uv[near[:, 1:]] - uv[:, None]
+    direction = offset / np.maximum(np.linalg.norm(offset, axis=2, keepdims=True), 1e-9)
+    at_border = np.linalg.norm(direction.mean(axis=1), axis=1) > AT_BORDER
+    for similar in (at_border, ~at_border):
+        rows = np.flatnonzero(similar)
+        if len(rows) >= count:
+            near[rows] = rows[cKDTree(uv[rows]).query(uv[rows], k=count)[1]]
+    return near
 
 
 def _climbed(

@@ -595,7 +595,7 @@ def decided(monkeypatch, first, rivals, **model):
 def test_a_pose_is_ambiguous_where_another_fits_nearly_as_well(monkeypatch, against):
     first = found_match(50, 1.0, against=against)
     # Of 50 beads, one more than were missing may be missing by chance.
-    margin = 10 / np.log(50 / (against + 1))
+    margin = np.log(1e4) / np.log(50 / (against + 1))
     score = first.score
     near, far = found_match(50, 1.1, turn=5), found_match(50, 1.1, turn=5)
     monkeypatch.setattr(

@@ -338,11 +338,12 @@ def _likelihood_of_sizes(
     """Return the log-likelihood of log responses (n,) to shadows of log sizes (n,) at uv (n, 2).
 
     A response is linear in the size, with the likeliest slope, and changes slowly across the
-    image. Responses of beads that overlap or lie before an edge are outliers, with any residual up
-    to the largest. The probability of an outlier is that among the beads around, one of which
-    stands for the whole image.
+    image, as it does with perspective. Responses of beads that overlap or lie before an edge are
+    outliers, with any residual up to the largest. The probability of an outlier is that among the
+    beads around, one of which stands for the whole image.
     """
     near = _neighbours(uv)
+    size = size - np.median(size[near], axis=1)  # without the perspective
     likelihoods = []
     for slope in np.linspace(*SIZE_SLOPES):
         level = response - slope * size

@@ -174,12 +174,15 @@ class _ImageSearch:
 def _shadows_of(image: FilteredImage, kind: tuple[float, int, bool | None]) -> np.ndarray:
     """Return places (k, 2) of shadows; kind: scale, number, whether they are bright.
 
-    Raises DataError.
+    Raises DataError if there are none, or too many of a kind that is not likely in the image.
     """
     scale, strongest, bright = kind
     lights = image.of_scale(scale)
     chosen = lights if bright is None else lights[bright : bright + 1]
-    return first_shadows(chosen, strongest).strongest(MAX_SHADOWS).uv
+    shadows = first_shadows(chosen, strongest)
+    if bright is not None and len(shadows.uv) > MAX_SHADOWS:
+        raise DataError(f'{len(shadows.uv)} round objects, which noise or texture may be')
+    return shadows.strongest(MAX_SHADOWS).uv
 
 
 def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:

@@ -49,14 +49,6 @@ def ports(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope='session', autouse=True)
-def no_waiting_for_the_disk():
-    """Only check descriptors in place of os.fsync: no test cuts the power."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, 'fsync', os.fstat)
-        yield
-
-
 ROS = 'tests/ros/'
 # Files whose tests share the calibrations of tests/rigs.py or tests/turning_rig.py: they run in
 # the same worker, so that each calibration is computed once.

@@ -130,6 +130,7 @@ class Kind(str, Enum):
     # Predicted beads of the phantom that are not observed.
     BEAD_ALONE = 'bead_alone'
     BEAD_AWAY = 'bead_away'
+    BEAD_CONFUSED = 'bead_confused'
     BEAD_CONTRAST = 'bead_contrast'
     BEAD_DISTURBED = 'bead_disturbed'
     BEAD_HIDDEN = 'bead_hidden'

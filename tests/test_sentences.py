@@ -55,7 +55,7 @@ from fluoro_calib_ros.findings import Finding, Kind, Place, too_few
 from fluoro_calib_ros.healing.diagnosis import Cause, Change
 from fluoro_calib_ros.images import detection, extraction, lattice, matching
 from fluoro_calib_ros.images.codec import as_grey
-from fluoro_calib_ros.images.growth import Seen
+from fluoro_calib_ros.images.growth import Coordinates, Seen
 from fluoro_calib_ros.images.marker_watch import doubt_in
 from fluoro_calib_ros.io.calibration import edited, exchanged, failed
 from fluoro_calib_ros.io.formats import registry
@@ -265,18 +265,22 @@ def bead(**changes):
     }
     beads = Fake(**{name: np.array([value]) for name, value in beads.items()})
     beads.uv = np.full((1, 2), beads.uv[0])
-    return extraction._reasons(beads, np.zeros((1, 2)))[0]
+    return extraction._reasons(beads, np.zeros((1, 2)), np.array([2.5]))[0]
 
 
 def not_measured(n=20):
-    view = Fake(outlines=lambda _: np.tile(np.eye(2), (n, 1, 1)))
+    view = Fake(
+        outlines=lambda _: np.tile(np.eye(2), (n, 1, 1)),
+        principal_distance_px=1.0,
+        depth=lambda _: np.ones(n),
+    )
     found = Fake(view=view, predicted=np.zeros((n, 2)), bead=np.arange(n), detection=np.arange(n))
     light = Fake(above=lambda _: None)
     seen = Fake(uv=np.zeros((n, 2)), in_field=lambda uv: np.ones(n, bool), radius_px=1.0)
     imaging = Fake(
         completed=lambda *_: imaging, size=np.ones(n), profile=None, noise=None, black=0
     )
-    model = Fake(xyz=np.zeros((n, 3)))
+    model = Coordinates(np.zeros((n, 3)), np.zeros(n))
     with mock.patch.multiple(
         extraction, measure_beads=mock.DEFAULT, _reasons=lambda *_: [extraction.LOST] * n
     ):
@@ -560,10 +564,17 @@ MAKERS = {
     Kind.NO_POSE: no_pose,
     Kind.POSE_UNSURE: lambda: raised(
         matching._check_evidence,
-        Fake(explained=0.01, evidence=99.0, expected=90, found=0.9, bead=np.arange(60)),
+        Fake(
+            **{'explained': 0.01, 'evidence': 99.0, 'expected': 90, 'found': 0.9},
+            bead=np.arange(60),
+            scale_px=0.1,
+            view=Fake(principal_distance_px=1.0, depth=lambda xyz: np.ones(len(xyz))),
+        ),
+        Fake(xyz=np.zeros((60, 3)), spacing_mm=10.0),
     ),
     Kind.BEAD_ALONE: lambda: extraction.ALONE,
     Kind.BEAD_AWAY: lambda: bead(uv=9.0),
+    Kind.BEAD_CONFUSED: lambda: extraction.CONFUSED,
     Kind.BEAD_CONTRAST: lambda: bead(depth=0.1),
     Kind.BEAD_DISTURBED: lambda: bead(misfit=99.0),
     Kind.BEAD_HIDDEN: lambda: bead(sigma=9.0),
@@ -925,6 +936,7 @@ SENTENCES = {
     ),
     Kind.BEAD_ALONE: 'its neighbours were not found',
     Kind.BEAD_AWAY: '# px from its prediction',
+    Kind.BEAD_CONFUSED: 'not distinguished from another bead',
     Kind.BEAD_CONTRAST: 'a contrast of #% of that of a bead',
     Kind.BEAD_DISTURBED: 'another object is next to it',
     Kind.BEAD_HIDDEN: 'hidden by another bead',

@@ -18,7 +18,7 @@ from ..photogrammetry.threads import one_thread
 from .contrasts import black_level, usual_depth
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
-from .growth import Match, Seen, nearby_residuals, supported
+from .growth import SURVEY_SIGMAS, Match, Seen, is_likelier, nearby_residuals, supported
 from .imaging import MOST, Expected, Imaging, first_imaging
 from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, measure_beads
@@ -38,6 +38,7 @@ RADII = (0.2, 5.0)  # radii of shadows of equal beads, relative to a typical one
 BLACK_ROUNDS = 4  # largest number of estimates of the grey value of no light
 RESIDUAL_SIGMAS = 4.5  # largest residual from the prediction by neighbours [standard deviations]
 FIRST_RESIDUAL_PX = 2.5
+DISPLACED_RADII = 0.5
 ALONE_RADII = 2.5  # least distance of an isolated bead from the next shadow [radii]
 MIN_ACCEPTED = 0.5  # least share of the matched beads that are measured well
 MIN_SCATTER_PX = 0.05
@@ -48,6 +49,7 @@ BENT_LEFT = 0.55
 LOST = Finding(Kind.BEAD_LOST, 'cut off, or lost while it was measured')
 DISTURBED = Finding(Kind.BEAD_DISTURBED, 'another object is next to it')
 HIDDEN = Finding(Kind.BEAD_HIDDEN, 'hidden by another bead')
+CONFUSED = Finding(Kind.BEAD_CONFUSED, 'not distinguished from another bead')
 VAGUE = (Kind.BEAD_UNSURE, Kind.BEAD_HIDDEN)
 ALONE = Finding(Kind.BEAD_ALONE, 'its neighbours were not found')
 
@@ -248,6 +250,7 @@ def _measured(
     measured = _measured_once(
         detections, seen, predicted, model=model, imaging=imaging, least=len(matched.bead)
     )
+    measured = _identified(measured)
     away = _away(measured)
     if away.any():
         # Misplaced beads have biased the predictions of their neighbours: predict without them.
@@ -333,17 +336,11 @@ def _measured_once(
         noise=imaging.noise,
         steps=steps,
     )
-    reasons = _reasons(beads, predicted.uv[shadows.row])
+    reach_px = model.reach_px(predicted.view, FIRST_RESIDUAL_PX)[shadows.row]
+    reasons = _reasons(beads, predicted.uv[shadows.row], reach_px)
     reasons = [reason if known else HIDDEN for reason, known in zip(reasons, sized)]
     good = np.array([reason is None for reason in reasons], dtype=bool)
-    if np.count_nonzero(good) < max(4, MIN_ACCEPTED * least):
-        measured_well = int(np.count_nonzero(good))
-        raise DataError(
-            f'the phantom is found with {least} beads, of which only {measured_well} can be '
-            'measured',
-            kind=Kind.BEADS_NOT_MEASURED,
-            numbers={'beads': least, 'measured': measured_well},
-        )
+    _check_most_measured(good, least)
     bead = shadows.row[good]
     view, _ = fit_view(predicted.view, model.xyz[bead], beads.uv[good], 3)
     predicted = _Predicted.of(view, model, bead, beads.uv[good])
@@ -356,6 +353,18 @@ def _measured_once(
         imaging=imaging,
         predicted=predicted,
     )
+
+
+def _check_most_measured(good: NDArray[np.bool_], least: int) -> None:
+    """Raise DataError unless MIN_ACCEPTED of so many beads are measured well."""
+    measured_well = int(np.count_nonzero(good))
+    if measured_well < max(4, MIN_ACCEPTED * least):
+        raise DataError(
+            f'the phantom is found with {least} beads, of which only {measured_well} can be '
+            'measured',
+            kind=Kind.BEADS_NOT_MEASURED,
+            numbers={'beads': least, 'measured': measured_well},
+        )
 
 
 def _of_centres(extraction: Extraction, measured: _Measured, model: PhantomModel) -> Extraction:
@@ -372,6 +381,48 @@ def _of_centres(extraction: Extraction, measured: _Measured, model: PhantomModel
         sigma=np.hypot(extraction.sigma, BENT_LEFT * bent_px),
         bent_px=float(np.sqrt(np.mean(bent_px**2))),
     )
+
+
+def _identified(measured: _Measured) -> _Measured:
+    """Exclude beads that are not distinguished from others.
+
+    A bead has to be much likelier at its own prediction than at that of any other. If predictions
+    may be off by half a radius, its shadow also has to be isolated, from measured beads and from
+    where others may be. Raises DataError if this excludes most beads.
+    """
+    rows = measured.rows
+    if len(rows) < 2:
+        return measured
+    uv = measured.beads.uv
+    place = measured.predicted.uv[rows]
+    sd_px = measured.predicted.sd_px[rows]
+    radius_px = measured.imaging.profile.radius_px
+    good = measured.good
+    other = _from_others(uv, place, np.ones(len(rows), dtype=bool))
+    is_certain = is_likelier((np.linalg.norm(uv - place, axis=1), other), sd_px)
+    reach_px = SURVEY_SIGMAS * sd_px
+    alone_px = ALONE_RADII * radius_px
+    is_alone = _from_others(uv, uv, good) > alone_px
+    is_alone &= _from_others(uv, place, ~good) > alone_px + reach_px
+    is_certain &= is_alone | (reach_px < DISPLACED_RADII * radius_px)
+    _check_most_measured(is_certain, len(rows))
+    reasons = [
+        CONFUSED if reason is None and not certain else reason
+        for reason, certain in zip(measured.reasons, is_certain)
+    ]
+    return replace(measured, reasons=reasons)
+
+
+def _from_others(
+    uv: NDArray[np.float64], place: NDArray[np.float64], chosen: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return distances (n,) of pixels (n, 2) from the nearest chosen place of another row."""
+    number = np.flatnonzero(chosen)
+    if not len(number):
+        return np.full(len(uv), np.inf)
+    distance, index = cKDTree(place[number]).query(uv, k=[1, 2])
+    is_own = np.append(number, -1)[index[:, 0]] == np.arange(len(uv))
+    return np.asarray(np.where(is_own, distance[:, 1], distance[:, 0]))
 
 
 def _away(measured: _Measured) -> NDArray[np.bool_]:
@@ -467,14 +518,20 @@ def _with_support(
 
 
 def _expected(predicted: _Predicted, seen: Seen, model: PhantomModel) -> Expected:
-    """Return expected shadows: at the detection of an isolated bead, else at the prediction."""
+    """Return expected shadows: at the detection of an isolated bead, else at the prediction.
+
+    Beads that may be displaced by more than a radius from their coordinates are expected at their
+    detections, too.
+    """
     rows = np.flatnonzero(seen.in_field(predicted.uv))
+    bead = predicted.bead
     start = predicted.uv.copy()
+    displaced = (model.reach_px(predicted.view, 0.0) > seen.radius_px)[bead]
+    start[bead[displaced]] = predicted.found[displaced]
     apart = np.full(len(start), np.inf)
     if len(rows) > 1:
         apart[rows] = cKDTree(start[rows]).query(start[rows], k=[2])[0][:, 0]
     alone = apart > ALONE_RADII * seen.radius_px
-    bead = predicted.bead
     start[bead[alone[bead]]] = predicted.found[alone[bead]]
     outlines = predicted.view.outlines(model.xyz)
     size = np.sqrt(np.abs(np.linalg.det(outlines)))
@@ -491,8 +548,13 @@ def _relative_sizes(model: PhantomModel) -> NDArray[np.float64]:
     return np.asarray(model.diameter_mm / np.median(model.diameter_mm))
 
 
-def _reasons(beads: Beads, predicted: NDArray[np.float64]) -> list[Finding | None]:
-    """Return the reasons why beads are not observed, None for observed beads."""
+def _reasons(
+    beads: Beads, predicted: NDArray[np.float64], reach_px: NDArray[np.float64]
+) -> list[Finding | None]:
+    """Return the reasons why beads are not observed, None for observed beads.
+
+    reach_px: (n,) largest distances from the predictions (n, 2).
+    """
     away = np.linalg.norm(beads.uv - predicted, axis=1)
     usual = usual_depth(beads)
     out: list[Finding | None] = []
@@ -509,7 +571,7 @@ def _reasons(beads: Beads, predicted: NDArray[np.float64]) -> list[Finding | Non
             reason = DISTURBED
         elif beads.sigma[number] > MAX_SIGMA_PX:
             reason = HIDDEN
-        elif off > FIRST_RESIDUAL_PX:
+        elif off > reach_px[number]:
             cause = f'{off:.1f} px from its prediction'
             reason = Finding(Kind.BEAD_AWAY, cause, numbers={'off_px': off})
         out.append(reason)

@@ -16,8 +16,16 @@ from scipy.spatial import cKDTree
 from ..errors import DataError
 from ..photogrammetry.rotations import matrix_from_vector, rotation_angle, vector_from_matrix
 from .growth import Match, Seen, grow, settle, start_view
-from .matching import MIN_BEADS, NEIGHBOURS, PhantomModel, is_evident, seeds_of, unambiguous
-from .pose_search import LocalPose, local_poses, nearby_map
+from .matching import (
+    MIN_BEADS,
+    NEIGHBOURS,
+    PhantomModel,
+    beads_map,
+    is_evident,
+    seeds_of,
+    unambiguous,
+)
+from .pose_search import LocalPose, local_poses
 from .view import View
 
 REACH = 0.1  # maximum motion between exposures, as a fraction of the image size
@@ -50,7 +58,7 @@ def follow(
     if len(seen.uv) < MIN_BEADS:
         return None
     limit = SCATTER_FACTOR * scale_px + SCATTER_PX
-    expected = settle(near, model.xyz, seen)
+    expected = settle(near, model, seen)
     if _fits(expected, limit):
         return expected
     for match in _elsewhere(seen, model, near, far):
@@ -100,22 +108,22 @@ def _elsewhere(
 ) -> Iterator[Match | None]:
     """Yield matches from a pose that is extrapolated, shifted over the image, or searched for."""
     if far is not None and far.ahead is not None:
-        yield settle(far.ahead, model.xyz, seen)
-    yield _over_the_image(seen, model.xyz, near)
+        yield settle(far.ahead, model, seen)
+    yield _over_the_image(seen, model, near)
     if far is not None:
         yield from _farther(seen, model, near)
 
 
-def _over_the_image(seen: Seen, xyz: NDArray[np.float64], near: View) -> Match | None:
+def _over_the_image(seen: Seen, model: PhantomModel, near: View) -> Match | None:
     """Return the match of a nearby pose after a shift in the image, None if there is none."""
-    predicted = near.project(xyz)
+    predicted = near.project(model.xyz)
     row = np.flatnonzero(seen.in_field(predicted))
     shift = _shift(predicted[row], seen) if len(row) >= MIN_BEADS else None
     if shift is None:
         return None
-    view = _shifted(near, shift, float(np.median(near.depth(xyz))))
+    view = _shifted(near, shift, float(np.median(near.depth(model.xyz))))
     middle_distance = np.linalg.norm(predicted[row] - predicted[row].mean(axis=0), axis=1)
-    return grow(view, int(row[np.argmin(middle_distance)]), xyz, seen)
+    return grow(view, int(row[np.argmin(middle_distance)]), model, seen)
 
 
 def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | None]:
@@ -126,9 +134,8 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
         seen_before = (np.abs(predicted - size / 2) < (0.5 + FAR_REACH) * size).all(axis=1)
     if not seen_before.any():
         return
-    beads = nearby_map(seen.uv, near.lens.image_size, seen.tolerance_px)
-    beads[~seen.field] = 2
     scale = near.principal_distance_px / float(np.median(near.depth(model.xyz[seen_before])))
+    beads = beads_map(seen, model, scale)
     scales = (FAR_SCALES[0] * scale, FAR_SCALES[1] * scale)
     reach = FAR_REACH * max(seen.field.shape)
     for seed in seeds_of(seen)[:FAR_SEEDS]:
@@ -139,7 +146,7 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
         views = [_turned(pose, near, model.xyz) for pose in poses]
         started = [(pose, view) for pose, view in zip(poses, views) if view is not None]
         for pose, view in started[:FAR_POSES]:
-            yield grow(view, pose.bead, model.xyz, seen)
+            yield grow(view, pose.bead, model, seen)
 
 
 def _turned(pose: LocalPose, near: View, xyz: NDArray[np.float64]) -> View | None:

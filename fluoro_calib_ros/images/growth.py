@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -26,6 +27,10 @@ LAST_TOLERANCE_PX = 2.5
 CELLS = 5  # regions along each side of the image
 MIN_CELL = 5  # least number of predicted beads in a region that is evaluated
 AMBIGUOUS_PX = 1.5  # least difference of a detection's distances from the two nearest predictions
+SURVEY_SIGMAS = 3.0  # largest displacement of a bead from its coordinates [standard deviations]
+# Least lead in log-likelihood of a pose, or of the id of a bead, over any other: one in ten
+# thousand may be mistaken.
+LIKELIER = float(np.log(1e4))
 SUPPORT = 12  # neighbours in space, of which MIN_SHARE must be found as well
 # Correlation length of the residuals of a view, as a share of half the image: a polynomial of
 # degree 6 has five extrema across it.
@@ -68,6 +73,35 @@ class Seen:
         inside = np.asarray(((places >= 0) & (places < (width, height))).all(axis=1))
         inside[inside] = self.field[places[inside, 1], places[inside, 0]]
         return inside
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Coordinates of the beads of a phantom."""
+
+    xyz: NDArray[np.float64]  #: (n, 3) [mm]
+    sd_mm: NDArray[np.float64]  #: (n,), their standard deviations
+
+    def sd_px(self, view: View) -> NDArray[np.float64]:
+        """Return standard deviations (n,) of predicted pixels by errors of the coordinates."""
+        return np.asarray(view.principal_distance_px * self.sd_mm / np.abs(view.depth(self.xyz)))
+
+    def reach_px(self, view: View, tolerance_px: float) -> NDArray[np.float64]:
+        """Return distances (n,) from predictions that a tolerance and these errors allow."""
+        return np.hypot(tolerance_px, SURVEY_SIGMAS * self.sd_px(view))
+
+
+def spacing_of(xyz: NDArray[np.float64]) -> float:
+    """Return the median distance of beads (n, 3) from the nearest one."""
+    return float(np.median(cKDTree(xyz).query(xyz, k=[2])[0]))
+
+
+def largest_sd(spacing_mm: float) -> float:
+    """Return the standard deviation of coordinates that distinguishes neighbouring beads [mm].
+
+    Two neighbours, displaced from each other by as much as is accepted, are half a spacing off.
+    """
+    return float(spacing_mm / (2 * np.sqrt(2) * SURVEY_SIGMAS))
 
 
 @dataclass(frozen=True)
@@ -122,13 +156,14 @@ def _turn_to(ray: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.eye(3) + k + k @ k / (1 + z[2])
 
 
-def grow(view: View, start: int, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
+def grow(view: View, start: int, phantom: Coordinates, seen: Seen) -> Match | None:
     """Grow a view from one bead over the phantom; return None if it does not fit.
 
     The radius around the bead grows in space, not in the image: beads behind it are predicted
     last, when the pose is known better. Beads found near their predictions are matched. start is
-    the row of the bead in xyz (n, 3) [mm].
+    the row of the bead.
     """
+    xyz = phantom.xyz
     distance = np.linalg.norm(xyz - xyz[start], axis=1)
     radius = float(np.partition(distance, min(START_BEADS, len(xyz) - 1))[:START_BEADS].max())
     farthest = float(distance.max())
@@ -140,18 +175,20 @@ def grow(view: View, start: int, xyz: NDArray[np.float64], seen: Seen) -> Match 
             row = row[inside]
             if len(row) < 4:
                 return None
-            bead, detection = pairs(predicted[inside], seen, seen.tolerance_px)
+            reach = phantom.reach_px(view, seen.tolerance_px)[row]
+            bead, detection = pairs(predicted[inside], seen, reach)
             if len(bead) < max(4, MIN_SHARE * len(row)):
                 return None
             view, _ = fit_view(view, xyz[row[bead]], seen.uv[detection], 1, 0.3)
         if radius >= farthest:
             break
         radius *= GROWTH
-    return settle(view, xyz, seen)
+    return settle(view, phantom, seen)
 
 
-def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
+def settle(view: View, phantom: Coordinates, seen: Seen) -> Match | None:
     """Match all beads with a view that is nearly right, and refine it."""
+    xyz = phantom.xyz
     view = view.with_degree(max(view.degree, LAST_DEGREE))
     tolerance = seen.tolerance_px
     scale = 0.0
@@ -163,7 +200,8 @@ def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
         row = np.flatnonzero(seen.in_field(predicted))
         if len(row) < 4:
             return None
-        bead, detection = pairs(predicted[row], seen, tolerance)
+        reach = phantom.reach_px(view, tolerance)[row]
+        bead, detection = pairs(predicted[row], seen, reach)
         if len(bead) < 4:
             return None
         bead = row[bead]
@@ -178,15 +216,18 @@ def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
             break
         tolerance = max(0.6 * tolerance, min(LAST_TOLERANCE_PX, seen.tolerance_px))
     predicted = view.project(xyz) + residual
-    return _judged(view, xyz, seen, predicted, scale)
+    return _judged(view, phantom, seen, predicted, scale)
 
 
 def pairs(
-    predicted: NDArray[np.float64], seen: Seen, tolerance: float
+    predicted: NDArray[np.float64], seen: Seen, reach: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of predictions (n, 2) and detections that are nearest to each other."""
-    distance, detection = seen.tree.query(predicted, distance_upper_bound=tolerance)
-    row = np.flatnonzero(np.isfinite(distance))
+    """Return the rows of predictions (n, 2) and detections that are nearest to each other.
+
+    reach: (n,) largest distances [px].
+    """
+    distance, detection = seen.tree.query(predicted, distance_upper_bound=float(reach.max()))
+    row = np.flatnonzero(distance < reach)
     order = row[np.argsort(distance[row], kind='stable')]
     _, first = np.unique(detection[order], return_index=True)
     matched = np.sort(order[first])
@@ -205,14 +246,14 @@ def nearby_residuals(
 
 
 def _judged(
-    view: View, xyz: NDArray[np.float64], seen: Seen, predicted: NDArray[np.float64], scale: float
+    view: View, phantom: Coordinates, seen: Seen, predicted: NDArray[np.float64], scale: float
 ) -> Match | None:
     """Return the match of settled predictions (n, 2), without regions that have diverged."""
     row = np.flatnonzero(seen.in_field(predicted))
     if len(row) < 4:
         return None
-    tolerance = min(LAST_TOLERANCE_PX, seen.tolerance_px)
-    bead, detection = pairs(predicted[row], seen, tolerance)
+    reach = phantom.reach_px(view, min(LAST_TOLERANCE_PX, seen.tolerance_px))[row]
+    bead, detection = pairs(predicted[row], seen, reach)
     is_found = np.zeros(len(row), dtype=bool)
     is_found[bead] = True
     # Two beads that overlap are detected as one, somewhere between them.
@@ -221,20 +262,20 @@ def _judged(
     )
     spacing = cKDTree(predicted[row]).query(predicted[row], k=[2])[0][:, 0]
     is_found |= np.isfinite(detection_distance) & (spacing < 2 * seen.radius_px)
-    prediction_distance, _ = cKDTree(predicted[row]).query(
-        seen.uv, distance_upper_bound=max(tolerance, 1.2 * seen.radius_px)
-    )
+    tree = cKDTree(predicted[row])
+    prediction_distance, nearest = tree.query(seen.uv)
     within, area = _outlined(seen.uv, predicted[row], seen.field.shape)
-    is_explained = np.isfinite(prediction_distance[within])
-    by_chance = -float(np.expm1(-np.pi * tolerance**2 * within.sum() / area))
+    near = np.maximum(reach, 1.2 * seen.radius_px)[nearest]
+    is_explained = (prediction_distance < near)[within]
+    by_chance = -float(np.expm1(-np.pi * np.mean(reach**2) * within.sum() / area))
     good = _good_cells(predicted[row], is_found, seen.field.shape)
     # A detection between two predictions may belong to either.
-    tree = cKDTree(predicted[row])
     distance, _ = tree.query(seen.uv[detection], k=2)
     is_unique = distance[:, 1] > distance[:, 0] + AMBIGUOUS_PX
+    is_unique &= is_likelier(distance.T, phantom.sd_px(view)[row][bead])
     matched = np.zeros(len(row), dtype=bool)
     matched[bead[is_unique]] = True
-    good &= supported(xyz[row], matched)
+    good &= supported(phantom.xyz[row], matched)
     accepted = good[bead] & is_unique
     return Match(
         view,
@@ -248,6 +289,17 @@ def _judged(
         against=int(np.sum(~is_found) + np.sum(~is_explained)),
         evidence=_evidence(is_found[spacing >= 2 * seen.radius_px], by_chance),
     )
+
+
+def is_likelier(
+    distance: Sequence[NDArray[np.float64]], sd_px: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return (n,) whether pixels are much likelier at their predictions than at the next ones.
+
+    distance: (2, n) from both predictions; sd_px: (n,), standard deviations of the predictions.
+    """
+    first, second = distance
+    return np.asarray(second**2 - first**2 > 2 * LIKELIER * sd_px**2)
 
 
 def _evidence(is_found: NDArray[np.bool_], by_chance: float) -> float:

@@ -24,7 +24,7 @@ from scipy.ndimage import binary_closing, binary_erosion
 from scipy.spatial import cKDTree
 
 from ..findings import Finding, Kind, Severity
-from .growth import MIN_SHARE, Match, Seen, settle
+from .growth import MIN_SHARE, Coordinates, Match, Seen, settle
 from .view import Lens, View, fit_view
 
 FLAT = 0.02  # largest thickness over the extent of a flat phantom
@@ -169,14 +169,13 @@ class GridPose:
     fit: Callable[[], Match | None]  #: returns the match, None if no pose fits
 
 
-def grid_poses(
-    grid: FlatGrid, xyz: NDArray[np.float64], seen: Seen, lens: Lens
-) -> Iterator[GridPose]:
+def grid_poses(grid: FlatGrid, phantom: Coordinates, seen: Seen, lens: Lens) -> Iterator[GridPose]:
     """Yield poses of a flat grid, those with the fewest contradictions first.
 
     Poses with equally many are in order of tilt, the least tilted first, then by how upright they
     are, then by the distance of their middle from that of the image.
     """
+    xyz = phantom.xyz
     detected = number_lattice(seen.uv)
     if detected is None:
         return
@@ -210,7 +209,7 @@ def grid_poses(
         if np.count_nonzero(known) < MIN_SHARE * len(known):
             return None
         view = _view(grid, xyz[bead[known]], seen.uv[detected.row[known]], lens)
-        return None if view is None else settle(view, xyz, seen)
+        return None if view is None else settle(view, phantom, seen)
 
     for (against, *_), change, shift in candidates:
         yield GridPose(against, len(detected.index), partial(fit, change, shift))

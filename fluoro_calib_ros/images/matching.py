@@ -20,7 +20,19 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
-from .growth import LAST_TOLERANCE_PX, Match, Seen, grow, settle, start_view
+from .growth import (
+    LAST_TOLERANCE_PX,
+    LIKELIER,
+    SURVEY_SIGMAS,
+    Coordinates,
+    Match,
+    Seen,
+    grow,
+    largest_sd,
+    settle,
+    spacing_of,
+    start_view,
+)
 from .lattice import CENTRAL, STEPS, FlatGrid, GridPose, grid_poses
 from .pose_search import (
     MERGED,
@@ -59,8 +71,6 @@ FITTED = 12  # number of ways to fit a grid to detections; a hexagonal grid has 
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
 AGREED = 3  # matches of the same pose after which the search ends if the pose is evident
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes distinguish beads
-# Least lead in log-likelihood of a pose over any other: one image in ten thousand may be mistaken.
-LIKELIER = float(np.log(1e4))
 SIZE_TAIL = 3.0  # residual from which a response is an outlier [standard deviations]
 SIZE_NEIGHBOURS = 12  # neighbours from which the usual response is estimated
 # Length of the mean direction to the neighbours of a bead from which it is at the border: on a
@@ -75,10 +85,9 @@ SCALE_BY_SIZE = (0.55, 1.6)  # ratio of a bead's image to its diameter, with the
 
 
 @dataclass(frozen=True)
-class PhantomModel:
+class PhantomModel(Coordinates):
     """Beads of a phantom, prepared for matching."""
 
-    xyz: NDArray[np.float64]  #: (n, 3) [mm]
     diameter_mm: NDArray[np.float64] | None  #: (n,)
     grid: FlatGrid | None  #: for a flat grid
     #: any of several poses that fit equally well is accepted: a regular grid looks alike in all
@@ -90,20 +99,20 @@ class PhantomModel:
         xyz: NDArray[np.float64],
         diameter_mm: NDArray[np.float64] | None = None,
         regular: bool = False,
+        sd_mm: NDArray[np.float64] | None = None,
     ) -> PhantomModel:
         """Return the model of beads (n, 3) [mm] with diameters (n,) [mm], if known.
 
-        Raises DataError if a regular phantom is not a flat grid.
+        sd_mm: (n,), standard deviations of the coordinates, 0 if not given. They are limited: no
+        pose with larger residuals is accepted, because it does not distinguish neighbours. Raises
+        DataError if a regular phantom is not a flat grid.
         """
         grid = FlatGrid.of(xyz)
         if regular and grid is None:
             raise DataError('the phantom is not a flat grid with rows and columns')
-        return cls(
-            xyz,
-            diameter_mm,
-            grid=grid,
-            regular=regular,
-        )
+        given_mm = np.zeros(len(xyz)) if sd_mm is None else sd_mm
+        sd_mm = np.minimum(given_mm, largest_sd(spacing_of(xyz)))
+        return cls(xyz, sd_mm, diameter_mm, grid=grid, regular=regular)
 
     @property
     def sizes_differ(self) -> bool:
@@ -114,12 +123,12 @@ class PhantomModel:
     @cached_property
     def spacing_mm(self) -> float:
         """Median distance of a bead from the nearest one."""
-        return float(np.median(cKDTree(self.xyz).query(self.xyz, k=[2])[0]))
+        return spacing_of(self.xyz)
 
     @cached_property
     def symmetries(self) -> tuple[Symmetry, ...]:
         """Motions that move many beads close to others, computed on first use."""
-        return symmetries_of(self.xyz, self.triples)
+        return symmetries_of(self, self.triples)
 
     @cached_property
     def triples(self) -> Triples:
@@ -140,7 +149,7 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
         )
     best = _grid_match(model.grid, seen, model, lens) if model.grid is not None else None
     if best is not None:
-        _check_evidence(best)
+        _check_evidence(best, model)
         return best
     agreed = 0
     for candidate in _candidates(seen, model, lens):
@@ -157,9 +166,9 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
             break
     if best is None:
         raise DataError('no pose of the phantom fits the beads in the image', kind=Kind.NO_POSE)
-    _check_evidence(best)
+    _check_evidence(best, model)
     best = unambiguous(best, seen, model)
-    _check_evidence(best)
+    _check_evidence(best, model)
     return best
 
 
@@ -170,7 +179,7 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
     """
     best: tuple[GridPose, Match] | None = None
     fitted: list[Match] = []
-    for number, pose in enumerate(grid_poses(grid, model.xyz, seen, lens)):
+    for number, pose in enumerate(grid_poses(grid, model, seen, lens)):
         # A right pose is among the first; others that fit as well may come later.
         if (len(fitted) if best else number) >= FITTED:
             break
@@ -236,7 +245,7 @@ def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
     If faces are seen from the edge, a pose extends to the far side of the phantom only gradually.
     """
     while not is_sure(one) and one.found >= EVIDENT[1][0] and one.explained >= MIN_EXPLAINED:
-        refined = settle(one.view, model.xyz, seen)
+        refined = settle(one.view, model, seen)
         if refined is None or refined.score <= one.score:
             break
         one = refined
@@ -253,12 +262,20 @@ def _is_supported(best: Match, shares: Sequence[tuple[float, float]]) -> bool:
     return any(best.found >= found and best.explained >= explained for found, explained in shares)
 
 
-def _check_evidence(best: Match) -> None:
-    """Raise DataError if too few predicted beads are found or too few detections are predicted."""
-    if is_evident(best) and len(best.bead) >= MIN_BEADS:
+def _check_evidence(best: Match, model: PhantomModel) -> None:
+    """Raise DataError if a pose predicts or explains too few beads, or leaves large residuals."""
+    scale = best.view.principal_distance_px / np.abs(best.view.depth(model.xyz[best.bead]))
+    residual_mm = best.scale_px / float(np.median(scale)) if len(best.bead) else np.inf
+    is_supported = _is_supported(best, EVIDENT) and len(best.bead) >= MIN_BEADS
+    if is_evident(best) and is_supported and residual_mm < largest_sd(model.spacing_mm):
         return
     cause = f'explains only {best.explained:.0%} of the beads in its outline'
-    if _is_supported(best, EVIDENT) and len(best.bead) >= MIN_BEADS:
+    if is_evident(best) and is_supported:
+        cause = (
+            f'leaves residuals of {residual_mm:.2f} mm, too large to distinguish beads '
+            f'{model.spacing_mm:.1f} mm apart'
+        )
+    elif is_supported:
         cause = 'may fit by chance'
     elif best.explained >= MIN_EXPLAINED or len(best.bead) < MIN_BEADS:
         cause = (
@@ -273,6 +290,7 @@ def _check_evidence(best: Match) -> None:
             'found': best.found,
             'explained': best.explained,
             'evidence': best.evidence,
+            'residual_mm': residual_mm,
         },
     )
 
@@ -414,7 +432,8 @@ def _alternatives(
             0.3,
         )
         # The final matching uses the same tolerance.
-        rival = settle(view, model.xyz, seen) if scale <= LAST_TOLERANCE_PX else None
+        reach_px = float(np.median(model.reach_px(view, LAST_TOLERANCE_PX)))
+        rival = settle(view, model, seen) if scale <= reach_px else None
         if rival is not None:
             yield rival
 
@@ -429,8 +448,7 @@ def _same(one: Match, other: Match) -> bool:
 
 def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     """Yield matches of poses, likeliest first."""
-    beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
-    beads[~seen.field] = 2
+    beads = beads_map(seen, model, _scale_by_extent(seen, model))
     order = seeds_of(seen)
     max_seeds = len(order)
     for (first, last), limits in LEVELS:
@@ -443,9 +461,18 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
                 seed, seen.uv, NEIGHBOURS[1], model.triples, beads, scales=scales
             ):
                 view = start_view(pose, lens, model.xyz)
-                candidate = grow(view, pose.bead, model.xyz, seen)
+                candidate = grow(view, pose.bead, model, seen)
                 if candidate is not None:
                     yield candidate
+
+
+def beads_map(seen: Seen, model: PhantomModel, scale: float) -> NDArray[np.uint8]:
+    """Return a map (h, w): 1 near a detection, 2 outside the field, else 0; scale in px/mm."""
+    displaced_px = SURVEY_SIGMAS * scale * float(np.median(model.sd_mm))
+    height, width = seen.field.shape
+    beads = nearby_map(seen.uv, (width, height), float(np.hypot(seen.tolerance_px, displaced_px)))
+    beads[~seen.field] = 2
+    return beads
 
 
 def seeds_of(seen: Seen) -> NDArray[np.int64]:

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from ..bodies.body import fitted_pose
 from ..photogrammetry.rotations import rotation_angle
+from .growth import SURVEY_SIGMAS, Coordinates, spacing_of
 from .lattice import REACH
 from .pose_search import Triples
 from .view import View
@@ -59,10 +60,13 @@ class Symmetry:
         )
 
 
-def symmetries_of(xyz: NDArray[np.float64], triples: Triples) -> tuple[Symmetry, ...]:
-    """Return the symmetries of beads (n, 3) [mm], those with the largest share first."""
+def symmetries_of(phantom: Coordinates, triples: Triples) -> tuple[Symmetry, ...]:
+    """Return the symmetries of a phantom, those with the largest share first."""
+    xyz = phantom.xyz
     tree = cKDTree(xyz)
-    reach = REACH * float(np.median(tree.query(xyz, k=[2])[0]))
+    displaced_mm = SURVEY_SIGMAS * np.sqrt(2) * float(np.median(phantom.sd_mm))
+    spacing_mm = spacing_of(xyz)
+    reach = min(float(np.hypot(REACH * spacing_mm, displaced_mm)), spacing_mm / 2)
     rotation, shift = _distinct(*_motions(xyz, triples, reach), xyz=xyz, reach=reach)
     sample = np.random.default_rng(0).permutation(xyz)[:SAMPLE]
     for limit in (2 * reach, reach):

@@ -99,8 +99,9 @@ class PhantomFollower:
     def __init__(self, settings: PhantomSettings) -> None:
         phantom = settings.phantom
         diameters = None if phantom.diameter_mm is None else phantom.diameter_mm.tobytes()
+        beads = phantom.xyz_mm.tobytes(), phantom.sd_mm.tobytes()
         self._settings = settings
-        self._model = _model_of(phantom.xyz_mm.tobytes(), diameters, settings.regular_grid)
+        self._model = _model_of(*beads, diameters, regular=settings.regular_grid)
         self._lens = settings.lens
         # Views of solved images whose distortion is used if a pose is not found.
         self._views: deque[View] = deque(maxlen=30)
@@ -206,10 +207,11 @@ class PhantomFollower:
 
 
 @lru_cache(maxsize=4)
-def _model_of(beads: bytes, diameters: bytes | None, regular: bool) -> PhantomModel:
+def _model_of(xyz: bytes, sd: bytes, diameters: bytes | None, regular: bool) -> PhantomModel:
     """Return a phantom prepared for matching, cached so that a worker reuses it."""
     diameter_mm = None if diameters is None else np.frombuffer(diameters)
-    return PhantomModel.of(np.frombuffer(beads).reshape(-1, 3), diameter_mm, regular)
+    xyz_mm = np.frombuffer(xyz).reshape(-1, 3)
+    return PhantomModel.of(xyz_mm, diameter_mm, regular, np.frombuffer(sd))
 
 
 MIN_STARTED = 0.5  # minimum fraction of the given markers found in the first image

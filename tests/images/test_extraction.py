@@ -396,6 +396,29 @@ def test_another_phantom_is_refused():
     assert lacks_certain_pose(error.value.finding)
 
 
+def test_a_phantom_built_by_hand_is_found_from_rough_coordinates():
+    true = small_phantom(3)[:40]
+    rough = true + np.random.default_rng(4).normal(0, 1.0, true.shape)
+    sd_mm = np.full(40, 1.0)
+    found = match(seen_of(true), PhantomModel.of(rough, sd_mm=sd_mm), LENS)
+    assert np.array_equal(found.bead, found.detection) and len(found.bead) > 30
+    other = PhantomModel.of(small_phantom(5)[:40], sd_mm=sd_mm)
+    with pytest.raises(DataError) as error:
+        match(seen_of(true), other, LENS)
+    assert lacks_certain_pose(error.value.finding)
+
+
+def test_neighbours_are_not_told_apart_by_coordinates_that_are_too_rough():
+    true = np.stack(np.meshgrid(*[np.arange(4) * 8.0] * 3), -1).reshape(-1, 3)
+    true += np.random.default_rng(6).uniform(-1, 1, true.shape)
+    spacing = PhantomModel.of(true).spacing_mm
+    assert PhantomModel.of(true, sd_mm=np.full(64, 9.0)).sd_mm.max() < 0.12 * spacing
+    rough = true + np.random.default_rng(7).normal(0, 1.5, true.shape)
+    with pytest.raises(DataError) as error:
+        match(seen_of(true), PhantomModel.of(rough, sd_mm=np.full(64, 1.5)), LENS)
+    assert lacks_certain_pose(error.value.finding)
+
+
 def test_labels_beside_the_phantom_do_not_hide_it():
     xyz = np.random.default_rng(3).uniform(-30, 30, (36, 3))
     beads = seen_of(xyz).uv

@@ -788,13 +788,23 @@ def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
         bead=np.arange(beads),
         expected=30,
         evidence=evidence,
+        scale_px=0.5,
+        view=Fake(principal_distance_px=5.0, depth=lambda xyz: np.ones(len(xyz))),
     )
+    model = Fake(xyz=np.zeros((40, 3)), spacing_mm=10.0)
     if cause is None:
-        matching._check_evidence(best)
+        matching._check_evidence(best, model)
+        largest_mm = 10.0 / 2 / (3 * np.sqrt(2))
+        best.scale_px = 5 * 0.99 * largest_mm
+        matching._check_evidence(best, model)
+        best.scale_px = 5 * 1.01 * largest_mm
+        with pytest.raises(DataError, match='too large to distinguish beads'):
+            matching._check_evidence(best, model)
+        best.scale_px = 0.5
         best.evidence = evidence - 0.1
         cause = 'may fit by chance'
     with pytest.raises(DataError, match=cause) as told:
-        matching._check_evidence(best)
+        matching._check_evidence(best, model)
     finding = told.value.finding
     assert finding.kind is Kind.POSE_UNSURE
     assert finding.numbers == {
@@ -802,6 +812,7 @@ def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
         'found': found,
         'explained': explained,
         'evidence': best.evidence,
+        'residual_mm': 0.1,
     }
 
 

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import extraction
 from fluoro_calib_ros.images.growth import (
+    Coordinates,
     Match,
     Seen,
     _good_cells,
@@ -99,9 +101,9 @@ def test_field_of_view_is_within_the_image_and_lit():
 def test_predictions_are_paired_with_what_is_nearest():
     one = seen([[10, 10], [20, 10], [50, 50]])
     predicted = np.array([[13.0, 10], [11, 10], [19, 10], [56, 50], [50, 47]])
-    rows, found = pairs(predicted, one, 5.0)
+    rows, found = pairs(predicted, one, np.full(5, 5.0))
     assert dict(zip(rows.tolist(), found.tolist())) == {1: 0, 2: 1, 4: 2}
-    assert pairs(predicted, one, 0.5)[0].tolist() == []
+    assert pairs(predicted, one, np.array([0.5, 2.0, 0.5, 0.5, 0.5]))[0].tolist() == [1]
 
 
 def test_score_of_a_match_counts_what_is_missing():
@@ -181,14 +183,14 @@ def test_bead_is_refused_at_its_limits(monkeypatch, name, good, bad, kind):
     for value, expected in ((good, None), (bad, kind)):
         one = beads(depth=np.ones(6))
         getattr(one, name)[2] = value
-        reasons = extraction._reasons(one, one.uv)
+        reasons = extraction._reasons(one, one.uv, np.full(6, 2.5))
         assert [r and r.kind for r in reasons] == [None, None, expected, None, None, None]
     away = beads(depth=np.ones(6))
-    limit = extraction.FIRST_RESIDUAL_PX
-    predicted = away.uv + np.outer([0, limit, limit + 0.01, 0, 0, 0], [0.6, 0.8])
-    found = extraction._reasons(away, predicted)
+    limit = np.array([2.5, 2.5, 2.5, 9.0, 2.5, 2.5])
+    predicted = away.uv + np.outer([0, 2.5, 2.51, 2.51, 0, 0], [0.6, 0.8])
+    found = extraction._reasons(away, predicted, limit)
     assert [r is None for r in found] == [True, True, False, True, True, True]
-    assert found[2].numbers['off_px'] == pytest.approx(limit + 0.01)
+    assert found[2].numbers['off_px'] == pytest.approx(2.51)
 
 
 def checked(uv, sigma, predicted, sd_px):
@@ -264,20 +266,57 @@ def test_bead_that_is_likely_half_a_pixel_off_is_not_observed(scatter, is_kept):
 def test_beads_of_a_line_start_where_they_were_found_alone():
     predicted = np.array([[0.0, 0], [30, 0], [33, 0], [80, 0], [200, 0]])
     outlines = circles(np.array([9.0, 4.5, 4.5, 2.25, 0]))
-    found = extraction._expected(
-        Fake(
-            view=Fake(outlines=lambda xyz: outlines),
-            bead=np.array([0, 1, 3]),
-            found=np.array([[1.0, 1], [31, 1], [81, 1]]),
-            uv=predicted,
-        ),
-        Fake(radius_px=2.0, in_field=lambda uv: uv[:, 0] < 100),
-        Fake(xyz=None),
+    view = Fake(outlines=lambda xyz: outlines, principal_distance_px=1.0, depth=lambda xyz: 1.0)
+    predicted_by = Fake(
+        view=view,
+        bead=np.array([0, 1, 3]),
+        found=np.array([[1.0, 1], [31, 1], [81, 1]]),
+        uv=predicted,
     )
+    seen = Fake(radius_px=2.0, in_field=lambda uv: uv[:, 0] < 100)
+    found = extraction._expected(predicted_by, seen, Coordinates(None, np.zeros(5)))
     assert found.uv.tolist() == [[1, 1], [30, 0], [33, 0], [81, 1]]
     assert found.seen.tolist() == [True, True, False, True]
     assert found.alone.tolist() == [True, False, False, True]
     np.testing.assert_allclose(found.radius, [2, 1, 1, 0.5])
+    # A bead that may be off by more than a radius starts where it was found in any case.
+    rough = Coordinates(None, np.full(5, 0.7))
+    displaced = extraction._expected(predicted_by, seen, rough)
+    assert displaced.uv.tolist() == [[1, 1], [31, 1], [33, 0], [81, 1]]
+
+
+def identified(places, sd_px, lost=()):
+    """Return kinds of reasons against beads measured at their predictions, and others far away."""
+    uv = np.array([[place, 0] for place in places] + [[0, 200], [0, 400], [0, 600], [0, 800]])
+    n = len(uv)
+    measured = extraction._Measured(
+        np.arange(n),
+        Fake(uv=uv.astype(float)),
+        [extraction.LOST if row in lost else None for row in range(n)],
+        radius_px=np.ones(n),
+        imaging=Fake(profile=Fake(radius_px=6.0)),
+        predicted=Fake(uv=uv.astype(float), sd_px=np.full(n, sd_px)),
+    )
+    reasons = extraction._identified(measured).reasons
+    assert reasons[len(places) :] == [None] * 4
+    return [r and r.kind for r in reasons[: len(places)]]
+
+
+def test_a_bead_is_observed_if_it_cannot_be_another_one():
+    confused = Kind.BEAD_CONFUSED
+    assert identified([0, 100, 200], 5.0) == [None] * 3
+    # The first two are as near to each other's predictions as errors of 5 px make likely.
+    assert identified([0, 20, 200], 5.0) == [confused, confused, None]
+    assert identified([0, 20, 200], 0.5) == [None] * 3
+    # With errors of 1.5 px they are identified, but their shadows may overlap.
+    assert identified([0, 14, 200], 1.5) == [confused, confused, None]
+    assert identified([0, 14, 200], 0.9) == [None] * 3
+    # The second one was not measured: it may be 4.5 px from its prediction.
+    assert identified([0, 19, 200], 1.5, lost=[1]) == [confused, Kind.BEAD_LOST, None]
+    assert identified([0, 19, 200], 1.5) == [None] * 3
+    with pytest.raises(DataError) as told:
+        identified([0, 20, 40, 60, 80], 5.0)
+    assert told.value.finding.numbers == {'beads': 9, 'measured': 4}
 
 
 # ---- markers in motion

@@ -17,6 +17,7 @@ from fluoro_calib_ros.images import growth, pose_search
 from fluoro_calib_ros.images.clipping import UNCLIPPED
 from fluoro_calib_ros.images.detection import PIXELS_AT_ONCE, responses
 from fluoro_calib_ros.images.growth import (
+    Coordinates,
     Seen,
     _good_cells,
     _judged,
@@ -180,11 +181,15 @@ def test_a_pose_begins_with_its_bead_where_it_was_found():
         np.testing.assert_allclose(seen[1:] - seen[0], expected, atol=0.011 * 0.025)
 
 
+def exact(xyz):
+    return Coordinates(xyz, np.zeros(len(xyz)))
+
+
 def test_pairs_are_nearest_to_each_other():
     seen = Seen.of(np.array([[10.0, 10], [20, 10], [30, 10], [40, 10]]), np.ones((50, 50)), 2.0)
     assert seen.tolerance_px == pytest.approx(0.2 * 25)
     predicted = np.array([[11.0, 10], [10.5, 10], [21, 11], [35, 12], [36.5, 10], [39, 30]])
-    bead, detection = pairs(predicted, seen, 5.0)
+    bead, detection = pairs(predicted, seen, np.full(6, 5.0))
     assert dict(zip(bead.tolist(), detection.tolist())) == {1: 0, 2: 1, 4: 3}
 
 
@@ -207,9 +212,10 @@ def test_evidence_of_a_match_counts_what_is_predicted_and_what_is_found():
     uv = np.concatenate([predicted[there] + 0.5, [[100.0, 100], [500, 300]]])
     seen = Seen.of(uv, np.ones((800, 800), bool), 5.0)
     outside = np.array([[900.0, 20], [np.nan, 4]])
+    view = Fake(principal_distance_px=1.0, depth=lambda xyz: np.ones(len(xyz)))
     match = _judged(
-        None,
-        np.concatenate([xyz, [[1e4, 0, 0], [0, 1e4, 0]]]),
+        view,
+        exact(np.concatenate([xyz, [[1e4, 0, 0], [0, 1e4, 0]]])),
         seen,
         np.concatenate([predicted, outside]),
         0.3,
@@ -218,10 +224,11 @@ def test_evidence_of_a_match_counts_what_is_predicted_and_what_is_found():
     assert match.found == pytest.approx(59 / 64) and match.explained == pytest.approx(59 / 61)
     assert match.bead.tolist() == there.tolist() and match.detection.tolist() == list(range(59))
     assert match.score == pytest.approx(59 - 5)
-    assert _judged(None, xyz, seen, predicted + 2000, 0.3) is None
+    assert _judged(view, exact(xyz), seen, predicted + 2000, 0.3) is None
     # Two neighbouring predictions share a detection: both count as found, neither is matched.
     doubled = np.concatenate([predicted, predicted[there[:1]] + [1.5, 0]])
-    two = _judged(None, np.concatenate([xyz, xyz[there[:1]] + [1, 0, 0]]), seen, doubled, 0.3)
+    twice = exact(np.concatenate([xyz, xyz[there[:1]] + [1, 0, 0]]))
+    two = _judged(view, twice, seen, doubled, 0.3)
     assert two.found == pytest.approx(60 / 65)
     assert two.bead.tolist() == there[1:].tolist()
 

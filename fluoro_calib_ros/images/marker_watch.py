@@ -107,11 +107,16 @@ class MarkerWatch:
     def recovered(
         self, measured: MeasuredMarkers, states: MarkerStates, frame: int
     ) -> tuple[Finding, ...]:
-        """Note which newly seen markers may be a false shadow in their gate."""
+        """Note which newly seen markers may be another shadow in their gate.
+
+        It may be a false one, or that of another marker that was not seen.
+        """
         out = []
-        for row in np.flatnonzero(measured.measured & (states.unseen > 1)).tolist():
+        again = states.unseen > 1
+        for row in np.flatnonzero(measured.measured & again).tolist():
+            density = self._density + density_of_others(states.motion, row, again)
             area = np.pi * self._gate**2 * states.motion.variance[row]
-            if area * self._density > FALSE_SHADOWS and row not in self._doubts.partners(row):
+            if area * density > FALSE_SHADOWS and row not in self._doubts.partners(row):
                 images = int(states.unseen[row]) - 1
                 out.append(self._doubt(Kind.MARKER_FOUND_AGAIN, row, frame, images=images))
         return tuple(out)
@@ -158,6 +163,18 @@ class MarkerWatch:
         """Note that a marker may be another object, and return the finding."""
         self._doubts.add(row, frame)
         return doubt_in(kind, frame, int(self._target_id[row]), **numbers)
+
+
+def density_of_others(motion: Motion, row: int, others: NDArray[np.bool_]) -> float:
+    """Return the mean density of other markers (n,) where a marker may be [1/px^2].
+
+    It is the integral of the product of the normal distributions of two predictions.
+    """
+    rows = np.flatnonzero(others)
+    rows = rows[rows != row]
+    variance = motion.variance[rows] + motion.variance[row]
+    squared = ((motion.uv[rows] - motion.uv[row]) ** 2).sum(axis=1)
+    return float((np.exp(-squared / (2 * variance)) / (2 * np.pi * variance)).sum())
 
 
 # Reasons why an id may be wrong.

@@ -457,6 +457,24 @@ def test_a_marker_found_again_in_a_wide_gate_is_doubted(unseen, variance, is_dou
 
 
 @pytest.mark.parametrize(
+    ('distance', 'unseen', 'is_doubted'),
+    [(26.0, 2, True), (28.0, 2, False), (10.0, 2, True), (10.0, 1, False)],
+)
+def test_a_marker_found_again_may_be_another_lost_one(distance, unseen, is_doubted):
+    """A gate of 1590 px^2 has 0.016 false shadows, and 0.004 of a marker 26.7 px away."""
+    watch, states, found, doubts = watched(
+        PLACES,
+        uv=[PLACES[0], PLACES[0] + [distance, 0], *PLACES[2:]],
+        measured=[True, False, False, False],
+        unseen=2,
+        variance=25.0,
+    )
+    states.unseen[1] = unseen
+    assert len(watch.recovered(found, states, 30)) == is_doubted
+    assert doubts.doubtful.tolist() == [is_doubted] + [False] * 3
+
+
+@pytest.mark.parametrize(
     ('away', 'own', 'is_doubted'), [(1.4, 0.0, True), (1.6, 0.0, False), (1.6, 0.7, True)]
 )
 def test_a_shadow_beside_a_marker_may_be_its_own(away, own, is_doubted):

@@ -24,32 +24,17 @@ def generate_launch_description():
     """Return the graph with the player, and with a bag that has to be given."""
     share = get_package_share_directory('fluoro_calib_ros')
     nodes = PythonLaunchDescriptionSource(os.path.join(share, 'launch', 'fluoro_calib.launch.py'))
-    phantom = LaunchConfiguration('phantom')
+    phantom = LaunchConfiguration('phantom')  # and all others reach the included file
     return LaunchDescription(
         [
             DeclareLaunchArgument('bag', description='bag to play: a folder or an MCAP file'),
-            DeclareLaunchArgument(
-                'bag_topics',
-                default_value='',
-                description='topics to play, e.g. [/a/target_observations] (default: all)',
-            ),
-            DeclareLaunchArgument(
-                'bag_rate', default_value='', description='speed relative to the recording'
-            ),
             DeclareLaunchArgument(
                 'phantom',
                 default_value='',
                 description='phantom.csv; empty: use saved calibrations, do not calibrate',
             ),
             IncludeLaunchDescription(
-                nodes,
-                launch_arguments={
-                    'bag': LaunchConfiguration('bag'),
-                    'bag_topics': LaunchConfiguration('bag_topics'),
-                    'bag_rate': LaunchConfiguration('bag_rate'),
-                    'phantom': phantom,
-                    'calibration': NotEqualsSubstitution(phantom, ''),
-                }.items(),
+                nodes, launch_arguments=[('calibration', NotEqualsSubstitution(phantom, ''))]
             ),
         ]
     )

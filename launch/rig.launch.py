@@ -15,7 +15,6 @@ from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration
 
 
 def generate_launch_description():
@@ -34,12 +33,6 @@ def generate_launch_description():
                 choices=['true', 'false', 'auto'],
                 description='false: without RViz; auto: where rviz2 is installed',
             ),
-            IncludeLaunchDescription(
-                nodes,
-                launch_arguments={
-                    'phantom': LaunchConfiguration('phantom'),
-                    'rviz': LaunchConfiguration('rviz'),
-                }.items(),
-            ),
+            IncludeLaunchDescription(nodes),  # which sees these arguments
         ]
     )

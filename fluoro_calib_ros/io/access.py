@@ -11,7 +11,6 @@ import secrets
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 from ..errors import DataError
@@ -211,12 +210,6 @@ def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
     finally:
         with suppress(OSError):  # it has been renamed unless there was an error
             os.unlink(temporary)
-
-
-def delete_file(path: Path) -> None:
-    """Delete a file if it exists. Raises DataError if it cannot be deleted."""
-    with os_errors(path, 'cannot be deleted'):
-        path.unlink(missing_ok=True)
 
 
 def write_bytes(path: PathLike, content: bytes) -> None:

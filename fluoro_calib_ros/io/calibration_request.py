@@ -22,8 +22,8 @@ from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..images.codec import JPEG_START
 from ..limits import MEGABYTE
-from .access import PathLike, check_safe_name, delete_file, make_folder, read_bytes, write_bytes
-from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM, VALIDATION_NAME
+from .access import PathLike, check_safe_name, make_folder, read_bytes, write_bytes
+from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .csv_table import read_names, write_names
 from .documents import read_json, write_json
 from .formats.native import read_known_orientations, write_known_orientations
@@ -34,12 +34,11 @@ VERSION = 1  # version of options.json
 
 
 def write_request(directory: PathLike, request: CalibrationRequest) -> None:
-    """Write the inputs of a calibration, and delete the verdict on an earlier one.
+    """Write the inputs of a calibration into a new folder.
 
     Raises DataError if a file cannot be written.
     """
     directory = Path(directory)
-    delete_file(directory / VALIDATION_NAME)
     write_observations_csv(directory / OBSERVATIONS, request.frames)
     write_phantom(directory / PHANTOM, request.phantom)
     document = {
@@ -53,8 +52,6 @@ def write_request(directory: PathLike, request: CalibrationRequest) -> None:
     write_names(directory, request.names)
     if request.known_orientations:
         write_known_orientations(directory / KNOWN_ORIENTATION, request.known_orientations)
-    else:
-        delete_file(directory / KNOWN_ORIENTATION)
 
 
 def read_request(

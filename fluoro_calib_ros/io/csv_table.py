@@ -29,7 +29,7 @@ from ..exposures.names import MAX_ID, Names, number_names
 from ..exposures.phantom import first_repeated
 from ..findings import sentence_of
 from ..limits import MAX_ROWS_CSV
-from .access import PathLike, atomic_file, check_rows, check_safe_name, delete_file, read_text
+from .access import PathLike, atomic_file, check_rows, check_safe_name, read_text
 
 if TYPE_CHECKING:
     import pandas
@@ -394,20 +394,15 @@ _KINDS = {'target': 'targets', 'exposure': 'exposures', 'fluoroscope': 'fluorosc
 
 
 def write_names(directory: PathLike, names: Names) -> None:
-    """Write the names into a folder; delete the file if there are no names.
-
-    Raises DataError if that fails.
-    """
-    path = Path(directory) / NAMES_FILE
+    """Write the names into a folder, no file if there are none. Raises DataError."""
     if not names:
-        delete_file(path)
         return
     rows = (
         [kind, identity, name]
         for kind, attribute in _KINDS.items()
         for name, identity in getattr(names, attribute).items()
     )
-    Table(COLUMNS, rows).write(path)
+    Table(COLUMNS, rows).write(Path(directory) / NAMES_FILE)
 
 
 def read_names(directory: PathLike) -> Names:

@@ -176,12 +176,15 @@ def test_previous_folder_and_files_of_the_user_are_kept(tmp_path, outcomes):
     (path / 'notes.txt').write_text('tube B was warm')
     (path / 'raw').mkdir()
     (path / 'raw' / 'frame.png').write_bytes(b'1')
-    (path / 'validation.json').write_text('{}')
+    earlier = ('validation.json', 'names.csv', 'known_orientation.yaml')
+    for name in earlier:
+        (path / name).write_text('of an earlier calibration')
     before = contents(path)
     save_outcome(path, outcomes[1])
     assert contents(tmp_path / 'result.previous') == before
     assert (path / 'notes.txt').read_text() == 'tube B was warm'
-    assert (path / 'raw' / 'frame.png').exists() and not (path / 'validation.json').exists()
+    assert (path / 'raw' / 'frame.png').exists()
+    assert not any((path / name).exists() for name in earlier)
 
 
 @pytest.mark.parametrize('stop', ['swap', 'old'])

@@ -134,6 +134,8 @@ class Row:
         Largest angle between the axis of the target and that of the fluoroscope; 180: any.
     anatomy : str
         'hand' or 'spine' in the beam.
+    rough_mm : float
+        Standard deviation of errors of the coordinates that the extraction knows.
     wanted : callable, optional
         The phantom to find, if it differs from the target.
     """
@@ -156,6 +158,7 @@ class Row:
     distortion_px: float = 8.0
     tilt_deg: float = 180.0
     anatomy: str = ''
+    rough_mm: float = 0.0
     wanted: Callable[[np.random.Generator], Target] | None = None
 
 
@@ -312,6 +315,10 @@ ROWS: dict[str, Row] = {
     'cube-36 plates': Row(cube(36), plates=5),
     'frame-503 plates': Row(frame(503), photons=4000.0, faces=70.0, tilt_deg=12.0),
     'cube-36 bone': Row(cube(36), bone=True),
+    'cube-36 by hand': Row(cube(36), rough_mm=1.0),
+    'lego-48 by hand': Row(lego(48), rough_mm=0.5),
+    'cube-48 three sizes by hand': Row(three_sizes(48), told=True, rough_mm=1.0),
+    'frame-503 by hand': Row(frame(503), photons=4000.0, tilt_deg=12.0, rough_mm=0.3),
     'cube-36 windowed': Row(cube(36), levels=(90.0, 250.0)),
     'cube-36 bone windowed': Row(cube(36), bone=True, levels=(90.0, 250.0)),
     'cube-36 bone logarithmic': Row(cube(36), bone=True, logarithmic=True),
@@ -373,6 +380,8 @@ ROWS: dict[str, Row] = {
     'spine for sheet': Row(nothing, anatomy='spine', wanted=sheet(20, 6.0, False, 1)),
     'cube-48 for cube-36': Row(cube(48), wanted=cube(36)),
     'lego-48 for cube-36': Row(lego(48), wanted=cube(36)),
+    'cube-48 for cube-36 by hand': Row(cube(48), rough_mm=1.0, wanted=cube(36)),
+    'spine for cube-36 by hand': Row(nothing, anatomy='spine', rough_mm=1.0, wanted=cube(36)),
     'cube-64 for lego-64': Row(cube(64), wanted=lego(64)),
     'cube-64 for frame-503': Row(cube(64), wanted=frame(503)),
     'frame-503 for cube-64': Row(frame(503), wanted=cube(64)),
@@ -825,7 +834,10 @@ def measured(name: str, images: int, first: int, pictures: Path | None) -> Itera
         other = ROWS[name].wanted
         wanted = scene.target if other is None else other(np.random.default_rng(seed))
         told = wanted.diameter if ROWS[name].told else None
-        model = PhantomModel.of(wanted.xyz, told, ROWS[name].regular)
+        rough_mm = ROWS[name].rough_mm
+        errors = np.random.default_rng([seed, 5]).normal(0, rough_mm, wanted.xyz.shape)
+        sd_mm = np.full(len(errors), rough_mm)
+        model = PhantomModel.of(wanted.xyz + errors, told, ROWS[name].regular, sd_mm)
         began = time.process_time()
         try:
             result: Extraction | DataError = extract_beads(scene.image, model, lens)

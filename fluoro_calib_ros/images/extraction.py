@@ -250,7 +250,8 @@ def _measured(
     measured = _measured_once(
         detections, seen, predicted, model=model, imaging=imaging, least=len(matched.bead)
     )
-    measured = _identified(measured)
+    measured = _identified(measured, matched.bead)
+    _check_measured(measured.good, len(matched.bead), 0)
     away = _away(measured)
     if away.any():
         # Misplaced beads have biased the predictions of their neighbours: predict without them.
@@ -340,7 +341,7 @@ def _measured_once(
     reasons = _reasons(beads, predicted.uv[shadows.row], reach_px)
     reasons = [reason if known else HIDDEN for reason, known in zip(reasons, sized)]
     good = np.array([reason is None for reason in reasons], dtype=bool)
-    _check_most_measured(good, least)
+    _check_measured(good, least, MIN_ACCEPTED * least)
     bead = shadows.row[good]
     view, _ = fit_view(predicted.view, model.xyz[bead], beads.uv[good], 3)
     predicted = _Predicted.of(view, model, bead, beads.uv[good])
@@ -355,15 +356,15 @@ def _measured_once(
     )
 
 
-def _check_most_measured(good: NDArray[np.bool_], least: int) -> None:
-    """Raise DataError unless MIN_ACCEPTED of so many beads are measured well."""
+def _check_measured(good: NDArray[np.bool_], beads: int, least: float) -> None:
+    """Raise DataError unless at least four, and so many, of the beads found are measured well."""
     measured_well = int(np.count_nonzero(good))
-    if measured_well < max(4, MIN_ACCEPTED * least):
+    if measured_well < max(4, least):
         raise DataError(
-            f'the phantom is found with {least} beads, of which only {measured_well} can be '
+            f'the phantom is found with {beads} beads, of which only {measured_well} can be '
             'measured',
             kind=Kind.BEADS_NOT_MEASURED,
-            numbers={'beads': least, 'measured': measured_well},
+            numbers={'beads': beads, 'measured': measured_well},
         )
 
 
@@ -383,12 +384,12 @@ def _of_centres(extraction: Extraction, measured: _Measured, model: PhantomModel
     )
 
 
-def _identified(measured: _Measured) -> _Measured:
+def _identified(measured: _Measured, detected: NDArray[np.int64]) -> _Measured:
     """Exclude beads that are not distinguished from others.
 
     A bead has to be much likelier at its own prediction than at that of any other. If predictions
-    may be off by half a radius, its shadow also has to be isolated, from measured beads and from
-    where others may be. Raises DataError if this excludes most beads.
+    may be off by half a radius, the fit from there may fail: the bead then has to be among those
+    detected, and its shadow isolated, from measured beads and from where others may be.
     """
     rows = measured.rows
     if len(rows) < 2:
@@ -402,10 +403,9 @@ def _identified(measured: _Measured) -> _Measured:
     is_certain = is_likelier((np.linalg.norm(uv - place, axis=1), other), sd_px)
     reach_px = SURVEY_SIGMAS * sd_px
     alone_px = ALONE_RADII * radius_px
-    is_alone = _from_others(uv, uv, good) > alone_px
+    is_alone = np.isin(rows, detected) & (_from_others(uv, uv, good) > alone_px)
     is_alone &= _from_others(uv, place, ~good) > alone_px + reach_px
     is_certain &= is_alone | (reach_px < DISPLACED_RADII * radius_px)
-    _check_most_measured(is_certain, len(rows))
     reasons = [
         CONFUSED if reason is None and not certain else reason
         for reason, certain in zip(measured.reasons, is_certain)

@@ -298,7 +298,7 @@ def unsure_bead(n=10):
         imaging=None,
         predicted=Fake(view=None, uv=np.zeros((n, 2)), sd_px=np.zeros(n)),
     )
-    return extraction._checked(None, None, measured).refused[0].finding
+    return extraction._checked(None, Fake(bead=range(n)), measured).refused[0].finding
 
 
 def drift(source, confirmed, level=ERROR):

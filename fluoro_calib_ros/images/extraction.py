@@ -251,7 +251,6 @@ def _measured(
         detections, seen, predicted, model=model, imaging=imaging, least=len(matched.bead)
     )
     measured = _identified(measured, matched.bead)
-    _check_measured(measured.good, len(matched.bead), 0)
     away = _away(measured)
     if away.any():
         # Misplaced beads have biased the predictions of their neighbours: predict without them.
@@ -438,7 +437,10 @@ def _away(measured: _Measured) -> NDArray[np.bool_]:
 
 
 def _checked(detections: Detections, matched: Match, measured: _Measured) -> Extraction:
-    """Exclude beads that are off the places predicted by their neighbours, or measured badly."""
+    """Exclude beads that are off the places predicted by their neighbours, or measured badly.
+
+    Raises DataError if no more than three are left.
+    """
     beads = measured.beads
     reasons = list(measured.reasons)
     for number in np.flatnonzero(_away(measured)):
@@ -446,6 +448,7 @@ def _checked(detections: Detections, matched: Match, measured: _Measured) -> Ext
         cause = f'{off:.2f} px from the prediction of its neighbours'
         reasons[number] = Finding(Kind.BEAD_AWAY, cause, numbers={'off_px': off})
     good = np.array([reason is None for reason in reasons], dtype=bool)
+    _check_measured(good, len(matched.bead), 0)
     usual = float(np.median(beads.sigma[good]))
     vague = good & (beads.sigma > max(SURE_SIGMA_PX, MAX_SIGMAS * usual))
     for number in np.flatnonzero(vague):

@@ -203,7 +203,7 @@ def checked(uv, sigma, predicted, sd_px):
         imaging='imaging',
         predicted=Fake(view=None, uv=predicted, sd_px=sd_px),
     )
-    return extraction._checked(None, None, measured)
+    return extraction._checked(None, Fake(bead=range(len(uv))), measured)
 
 
 def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others():

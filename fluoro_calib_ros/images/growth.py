@@ -27,6 +27,9 @@ LAST_TOLERANCE_PX = 2.5
 CELLS = 5  # regions along each side of the image
 MIN_CELL = 5  # least number of predicted beads in a region that is evaluated
 AMBIGUOUS_PX = 1.5  # least difference of a detection's distances from the two nearest predictions
+# Least evidence of a pose for each radius while it grows: chance finds so many beads in one of ten
+# places.
+GROWN_EVIDENCE = float(np.log(10))
 SURVEY_SIGMAS = 3.0  # largest displacement of a bead from its coordinates [standard deviations]
 # Least lead in log-likelihood of a pose, or of the id of a bead, over any other: one in ten
 # thousand may be mistaken.
@@ -179,6 +182,10 @@ def grow(view: View, start: int, phantom: Coordinates, seen: Seen) -> Match | No
             bead, detection = pairs(predicted[inside], seen, reach)
             if len(bead) < max(4, MIN_SHARE * len(row)):
                 return None
+            by_chance = _by_chance(reach, *_outlined(seen.uv, predicted[inside], seen.field.shape))
+            found = np.isin(np.arange(len(row)), bead)
+            if _evidence(found, by_chance) < GROWN_EVIDENCE:
+                return None
             view, _ = fit_view(view, xyz[row[bead]], seen.uv[detection], 1, 0.3)
         if radius >= farthest:
             break
@@ -267,7 +274,7 @@ def _judged(
     within, area = _outlined(seen.uv, predicted[row], seen.field.shape)
     near = np.maximum(reach, 1.2 * seen.radius_px)[nearest]
     is_explained = (prediction_distance < near)[within]
-    by_chance = -float(np.expm1(-np.pi * np.mean(reach**2) * within.sum() / area))
+    by_chance = _by_chance(reach, within, area)
     good = _good_cells(predicted[row], is_found, seen.field.shape)
     # A detection between two predictions may belong to either.
     distance, _ = tree.query(seen.uv[detection], k=2)
@@ -300,6 +307,14 @@ def is_likelier(
     """
     first, second = distance
     return np.asarray(second**2 - first**2 > 2 * LIKELIER * sd_px**2)
+
+
+def _by_chance(reach: NDArray[np.float64], within: NDArray[np.bool_], area: int) -> float:
+    """Return the probability that a detection is within reach of a place.
+
+    within: which detections are within some area [px^2]; they are assumed to be anywhere in it.
+    """
+    return -float(np.expm1(-np.pi * np.mean(reach**2) * within.sum() / max(area, 1)))
 
 
 def _evidence(is_found: NDArray[np.bool_], by_chance: float) -> float:

@@ -564,13 +564,7 @@ MAKERS = {
     Kind.NO_POSE: no_pose,
     Kind.POSE_UNSURE: lambda: raised(
         matching._check_evidence,
-        Fake(
-            **{'explained': 0.01, 'evidence': 99.0, 'expected': 90, 'found': 0.9},
-            bead=np.arange(60),
-            scale_px=0.1,
-            view=Fake(principal_distance_px=1.0, depth=lambda xyz: np.ones(len(xyz))),
-        ),
-        Fake(xyz=np.zeros((60, 3)), spacing_mm=10.0),
+        Fake(explained=0.01, evidence=99.0, expected=90, found=0.9, bead=np.arange(60)),
     ),
     Kind.BEAD_ALONE: lambda: extraction.ALONE,
     Kind.BEAD_AWAY: lambda: bead(uv=9.0),

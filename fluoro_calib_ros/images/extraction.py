@@ -38,6 +38,8 @@ RADII = (0.2, 5.0)  # radii of shadows of equal beads, relative to a typical one
 BLACK_ROUNDS = 4  # largest number of estimates of the grey value of no light
 RESIDUAL_SIGMAS = 4.5  # largest residual from the prediction by neighbours [standard deviations]
 FIRST_RESIDUAL_PX = 2.5
+# Displacement of the start of a fit from which it may end beside the shadow: fits that started one
+# radius off ended 0.2 to 0.4 radii off.
 DISPLACED_RADII = 0.5
 ALONE_RADII = 2.5  # least distance of an isolated bead from the next shadow [radii]
 MIN_ACCEPTED = 0.5  # least share of the matched beads that are measured well

@@ -149,7 +149,7 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
         )
     best = _grid_match(model.grid, seen, model, lens) if model.grid is not None else None
     if best is not None:
-        _check_evidence(best, model)
+        _check_evidence(best)
         return best
     agreed = 0
     for candidate in _candidates(seen, model, lens):
@@ -166,9 +166,10 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
             break
     if best is None:
         raise DataError('no pose of the phantom fits the beads in the image', kind=Kind.NO_POSE)
-    _check_evidence(best, model)
+    _check_evidence(best)
     best = unambiguous(best, seen, model)
-    _check_evidence(best, model)
+    _check_evidence(best)
+    _check_residuals(best, model)
     return best
 
 
@@ -262,20 +263,12 @@ def _is_supported(best: Match, shares: Sequence[tuple[float, float]]) -> bool:
     return any(best.found >= found and best.explained >= explained for found, explained in shares)
 
 
-def _check_evidence(best: Match, model: PhantomModel) -> None:
-    """Raise DataError if a pose predicts or explains too few beads, or leaves large residuals."""
-    scale = best.view.principal_distance_px / np.abs(best.view.depth(model.xyz[best.bead]))
-    residual_mm = best.scale_px / float(np.median(scale)) if len(best.bead) else np.inf
-    is_supported = _is_supported(best, EVIDENT) and len(best.bead) >= MIN_BEADS
-    if is_evident(best) and is_supported and residual_mm < largest_sd(model.spacing_mm):
+def _check_evidence(best: Match) -> None:
+    """Raise DataError if too few predicted beads are found or too few detections are predicted."""
+    if is_evident(best) and len(best.bead) >= MIN_BEADS:
         return
     cause = f'explains only {best.explained:.0%} of the beads in its outline'
-    if is_evident(best) and is_supported:
-        cause = (
-            f'leaves residuals of {residual_mm:.2f} mm, too large to distinguish beads '
-            f'{model.spacing_mm:.1f} mm apart'
-        )
-    elif is_supported:
+    if _is_supported(best, EVIDENT) and len(best.bead) >= MIN_BEADS:
         cause = 'may fit by chance'
     elif best.explained >= MIN_EXPLAINED or len(best.bead) < MIN_BEADS:
         cause = (
@@ -290,9 +283,21 @@ def _check_evidence(best: Match, model: PhantomModel) -> None:
             'found': best.found,
             'explained': best.explained,
             'evidence': best.evidence,
-            'residual_mm': residual_mm,
         },
     )
+
+
+def _check_residuals(best: Match, model: PhantomModel) -> None:
+    """Raise DataError if the residuals of a pose do not distinguish neighbouring beads."""
+    depth_mm = float(np.median(best.view.depth(model.xyz[best.bead])))
+    residual_mm = best.scale_px * depth_mm / best.view.principal_distance_px
+    if residual_mm > largest_sd(model.spacing_mm):
+        raise DataError(
+            f'the best pose of the phantom leaves residuals of {residual_mm:.2f} mm, too large to '
+            f'distinguish beads {model.spacing_mm:.1f} mm apart',
+            kind=Kind.POSE_UNSURE,
+            numbers={'residual_mm': residual_mm, 'spacing_mm': model.spacing_mm},
+        )
 
 
 def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = np.pi) -> Match:

@@ -765,6 +765,20 @@ def test_what_one_size_of_shadows_does_not_show_is_looked_for_with_another(monke
         search.markers()
 
 
+def test_residuals_have_to_distinguish_neighbouring_beads():
+    view = Fake(principal_distance_px=5000.0, depth=lambda xyz: np.full(len(xyz), 1000.0))
+    model = Fake(xyz=np.zeros((40, 3)), spacing_mm=10.0)
+    # Two neighbours, three standard deviations off each, in opposite directions: half a spacing.
+    largest_px = 5 * 10.0 / 2 / (3 * np.sqrt(2))
+    best = Fake(view=view, bead=np.arange(20), scale_px=0.99 * largest_px)
+    matching._check_residuals(best, model)
+    best.scale_px = 1.01 * largest_px
+    with pytest.raises(DataError, match='too large to distinguish beads') as told:
+        matching._check_residuals(best, model)
+    assert told.value.finding.kind is Kind.POSE_UNSURE
+    assert told.value.finding.numbers['residual_mm'] == pytest.approx(1.01 * largest_px / 5)
+
+
 @pytest.mark.parametrize(
     ('found', 'explained', 'beads', 'cause'),
     [
@@ -788,23 +802,13 @@ def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
         bead=np.arange(beads),
         expected=30,
         evidence=evidence,
-        scale_px=0.5,
-        view=Fake(principal_distance_px=5.0, depth=lambda xyz: np.ones(len(xyz))),
     )
-    model = Fake(xyz=np.zeros((40, 3)), spacing_mm=10.0)
     if cause is None:
-        matching._check_evidence(best, model)
-        largest_mm = 10.0 / 2 / (3 * np.sqrt(2))
-        best.scale_px = 5 * 0.99 * largest_mm
-        matching._check_evidence(best, model)
-        best.scale_px = 5 * 1.01 * largest_mm
-        with pytest.raises(DataError, match='too large to distinguish beads'):
-            matching._check_evidence(best, model)
-        best.scale_px = 0.5
+        matching._check_evidence(best)
         best.evidence = evidence - 0.1
         cause = 'may fit by chance'
     with pytest.raises(DataError, match=cause) as told:
-        matching._check_evidence(best, model)
+        matching._check_evidence(best)
     finding = told.value.finding
     assert finding.kind is Kind.POSE_UNSURE
     assert finding.numbers == {
@@ -812,7 +816,6 @@ def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
         'found': found,
         'explained': explained,
         'evidence': best.evidence,
-        'residual_mm': 0.1,
     }
 
 

@@ -366,8 +366,13 @@ def test_cancelled_healing_changes_nothing_and_a_second_one_is_refused(rig):
     ],
 )
 def test_refused_healing_gives_the_reason(rig, fields, message):
-    answer = rig.client.result_of(rig.client.heal(**fields).get_result_async())
-    assert answer.status == ABORTED and answer.result.message == message
+    def refused():
+        answer = rig.client.result_of(rig.client.heal(**fields).get_result_async())
+        assert answer.status == ABORTED
+        return answer.result.message == message
+
+    # The node may still read frames of an earlier stream.
+    rig.client.wait_until(refused, what='the reason')
 
 
 def test_what_is_missing_is_told(graph, tmp_path, calibrated):

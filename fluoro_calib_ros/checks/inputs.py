@@ -35,8 +35,8 @@ from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.diagnosis import MAX_RELATIVE_SD
 from ..photogrammetry.noise import CERTAIN
-from ..photogrammetry.plane_resection import flatness, plane_of
-from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
+from ..photogrammetry.plane_resection import is_flat, plane_of
+from ..photogrammetry.resection import decompose, robust_dlt, squared_residuals
 from ..photogrammetry.rig_orientation import KnownOrientation
 from .check import rms
 from .mixed_units import AT, DISTANCES_MM, FIT, MAX_TESTED, OFF, mixed_units
@@ -235,7 +235,7 @@ def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: NDArray[np.int64])
     uv = np.asarray(frame.uv, dtype=float)[on_phantom]
     try:
         with np.errstate(all='ignore'):
-            if flatness(xyz) < MIN_FLATNESS:
+            if is_flat(xyz):
                 xy = plane_of(xyz).coordinates(xyz)
                 squared = squared_residuals(robust_dlt(xy, uv), xy, uv)
                 return Fit(float(np.sqrt(np.median(squared))), False, None)

@@ -385,6 +385,8 @@ def _worst_cell(
     n = n[:, is_full]
     means = [sums[:, g].sum(axis=1) / k[:, None] for g, k in zip(groups, n)]
     scatter, freedom = _scatter(sums, counts, groups, means)
+    if not freedom.any():
+        return CellTrend(0.0, np.inf, np.asarray(image_size) / 2)
     # Variance of a residual: that of the cell, or of all cells if it is larger.
     pooled = scatter.sum() / max(freedom.sum(), 1)
     variance = np.maximum(scatter / np.maximum(freedom, 1), pooled) * np.sum(1 / n, axis=0)

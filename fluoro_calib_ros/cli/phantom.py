@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from .arguments import number_in
-from .output import print_result
+from .output import print_note, print_result
 
 NAME = 'phantom'
 HELP = 'Write the phantom file of a regular sheet or block from its drawing, with a picture.'
@@ -113,6 +113,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--out', type=Path, metavar='OUT.csv', help='the same, as other commands name it'
     )
+    parser.add_argument(
+        '--add-to',
+        type=Path,
+        metavar='PHANTOM',
+        help='phantom of any format that is written with the drawing as a further part, such as a '
+        'cube with a sheet; each image shows one of the parts; the ids of the drawing are raised '
+        'by a power of ten',
+    )
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
@@ -132,6 +140,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..exposures.phantom import Drawing, require_size
     from ..io.access import write_bytes
     from ..io.phantom import write_phantom
+    from ..jobs.sources import read_survey
     from ..report.figures import phantom_figure, picture_bytes
 
     picture = arguments.picture
@@ -148,19 +157,30 @@ def run(arguments: argparse.Namespace) -> None:
     )
     phantom = drawing.phantom()
     require_size(phantom)
+    count = len(phantom.target_id)
+    raised = 0
+    if arguments.add_to is not None:
+        survey = read_survey(arguments.add_to)
+        whole = survey.phantom.with_part(phantom)
+        raised = int(whole.target_id[-count] - phantom.target_id[0])
+        phantom = whole
+        for note in survey.notes:
+            print_note(note)
     picture_content = picture_bytes(phantom_figure(drawing), picture.suffix.lower())
     write_phantom(arguments.out, phantom)
     write_bytes(picture, picture_content)
-    count = len(phantom.target_id)
     document = {
         'out': str(arguments.out),
         'picture': str(picture),
         'targets': count,
         'blocked': drawing.blocked_id.tolist(),
+        'ids_raised_by': raised,
     }
     text = (
         f'{count} targets, {len(drawing.blocked_id)} positions are blocked\nwritten to '
         f'{arguments.out}; compare {picture} with the part: ids from the upper left, blocked '
         'positions crossed out'
     )
+    if raised:
+        text += f'\n{arguments.out} has {raised} more than the picture in the ids of this part'
     print_result(arguments, document, text)

@@ -427,7 +427,8 @@ def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
     Its variance is that of the inlier residuals, which are smaller than the noise by the root of
     their redundancy numbers, plus that of the distortion of an exposure about the model. The scale
     of a Student-t noise cannot replace it: where the tails are heavy, that scale is smaller than
-    the standard deviation of its core.
+    the standard deviation of its core. Residuals that show less than half of the noise would lead
+    to a smaller value if the survey is better than its standard deviations; it is not used then.
     """
     noise_model = run.after.noise
     if noise_model.loss != 'huber' and noise_model.nu >= EQUAL_WEIGHTS_NU:
@@ -438,7 +439,11 @@ def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
     rows = rows[run.after.inliers[rows]]
     square = np.sum(run.after.residuals[rows] ** 2, axis=1) / 2
     between = run.between_exposures.get(name, np.zeros(len(rows)))
-    variance = np.sum(square) / np.sum(redundancy[rows]) + np.mean(between)
+    variance = np.sum(square) / np.sum(redundancy[rows])
+    if np.mean(redundancy[rows]) < 0.5:
+        scale = noise_model.scale * float(np.median(run.measured.network.sigma[rows]))
+        variance = max(variance, scale**2)
+    variance += np.mean(between)
     squares = square / np.maximum(redundancy[rows], MIN_REDUNDANCY) + between
     profile = fitted_profile(run.measured.network.uv[rows], squares, run.measured.image_size[f])
     return _ImageNoise(float(np.sqrt(variance)), profile)

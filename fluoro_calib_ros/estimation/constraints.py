@@ -18,6 +18,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.network import MIN_RAYS
+from ..photogrammetry.plane_resection import is_flat
 from ..photogrammetry.precision import covariance_of_exteriors
 from ..photogrammetry.unknowns import (
     RIGID_SD_MM,
@@ -64,15 +65,29 @@ class RelativeOrientation:
 
 
 def paired_exposures(measured: Measured, b: int) -> NDArray[np.int64]:
-    """Return the rows (k, 2) of exposures of fluoroscopes 0 and b with the same number."""
+    """Return the rows (k, 2) of exposures of fluoroscopes 0 and b that orient the rig.
+
+    They have the same number and `orients` holds.
+    """
+    network = measured.network
     row = {
         (int(f), frame.number): j
-        for j, (f, frame) in enumerate(zip(measured.network.fluoroscope, measured.frames))
+        for j, (f, frame) in enumerate(zip(network.fluoroscope, measured.frames))
+        if orients(network.survey_mm[network.point[network.exposure == j]], network.survey_mm)
     }
     pairs = [
         (row[0, number], j) for (f, number), j in row.items() if f == b and (0, number) in row
     ]
     return np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def orients(shown: NDArray[np.float64], targets: NDArray[np.float64]) -> bool:
+    """Return whether exposures of targets `shown` (k, 3) can show the orientation of a rig.
+
+    targets (n, 3): of all exposures. If there are targets in space, flat ones are those of a grid
+    that is placed in front of each detector in turn, and possibly without a mark.
+    """
+    return is_flat(targets) or not is_flat(shown)
 
 
 def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> NDArray[np.bool_]:

@@ -21,9 +21,9 @@ from ..photogrammetry.adjustment import TOLERANCE, Adjustment, adjust
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.outliers import adjust_and_estimate_noise
-from ..photogrammetry.plane_resection import flatness, plane_of, tilt_of
+from ..photogrammetry.plane_resection import is_flat, plane_of, tilt_of
 from ..photogrammetry.precision import Precision, precision
-from ..photogrammetry.resection import MIN_FLATNESS, Resection, refine_resection, resection_at
+from ..photogrammetry.resection import Resection, refine_resection, resection_at
 from ..photogrammetry.rig_orientation import (
     ExteriorPrior,
     KnownOrientation,
@@ -106,7 +106,7 @@ def undetermined(network: Network) -> DataError:
     For flat targets that are tilted little, noise decides whether the matrix is singular; the
     reported cause is that they are flat.
     """
-    if flatness(network.survey_mm) < MIN_FLATNESS:
+    if is_flat(network.survey_mm):
         return DataError(TOO_FLAT)
     return DataError(SINGULAR, kind=Kind.UNDETERMINED)
 
@@ -213,11 +213,15 @@ class _Task:
             and all((name, frame.number) in starts.exterior for frame in frames)
         )
 
-    def min_exposures(self, name: str, untilted: bool = True) -> int:
+    def min_exposures(self, name: str, frames: Sequence[Frame], untilted: bool = True) -> int:
         """Return the number of exposures needed; untilted: targets are parallel to the image."""
         if self.sensors is not None or name in self.known:
             return 1
-        return 1 if untilted and self.principal_distance is not None else MIN_EXPOSURES
+        if untilted and self.principal_distance is not None:
+            return 1
+        # A flat target determines the distortion, one in space the interior orientation.
+        flat = {is_flat(self.xyz(frame)) for frame in frames}
+        return MIN_EXPOSURES if len(flat) < 2 else 2
 
     def min_targets(self, name: str) -> int:
         """Return the number of targets that an exposure needs."""
@@ -350,7 +354,7 @@ def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
         for frame, resection in zip(ordered, resections)
         if resection is not None
     ]
-    needed = task.min_exposures(name, untilted)
+    needed = task.min_exposures(name, [frame for frame, _ in fitting], untilted)
     if len(fitting) < needed:
         if not misfits:
             raise DataError(_too_few(name, len(fitting), needed, excluded))
@@ -410,10 +414,7 @@ def _are_untilted(
         if resection is None:
             continue
         xyz = task.xyz(frame)
-        if (
-            flatness(xyz) >= MIN_FLATNESS
-            or tilt_of(resection.rotation, plane_of(xyz)) > UNTILTED_RAD
-        ):
+        if not is_flat(xyz) or tilt_of(resection.rotation, plane_of(xyz)) > UNTILTED_RAD:
             return False
     return any(resection is not None for resection in resections)
 
@@ -421,7 +422,7 @@ def _are_untilted(
 def is_hardly_tilted(measured: Measured) -> bool:
     """Whether all targets are flat, and initially tilted less than advised."""
     survey = measured.network.survey_mm
-    if flatness(survey) >= MIN_FLATNESS:
+    if not is_flat(survey):
         return False
     plane = plane_of(survey)
     return all(tilt_of(rotation, plane) < TILTED_RAD for rotation in measured.start.rotation)
@@ -461,7 +462,7 @@ def _usable_frames(
             )
         else:
             ordered.append(frame)
-    needed = task.min_exposures(name)
+    needed = task.min_exposures(name, ordered)
     if len(ordered) < needed:
         raise DataError(_too_few(name, len(ordered), needed, excluded))
     return ordered, excluded

@@ -51,7 +51,7 @@ from ..photogrammetry.unknowns import (
     RelativePose,
     relative_poses,
 )
-from .constraints import derivatives_of_pairs, mean_of_pairs, paired_exposures
+from .constraints import derivatives_of_pairs, mean_of_pairs, orients, paired_exposures
 from .fixed_calibration import (
     fixed_corrections,
     network_of_calibrations,
@@ -214,7 +214,7 @@ def orientation_and_scatter(
     DataError as `orientation_of_capture`, and if no exposures can be paired.
     """
     _validate(frames, phantom, calibrations)
-    paired = _paired(frames)
+    paired = _paired(_orienting(frames, phantom))
     with one_thread():
         measured = network_of_calibrations(paired, phantom, calibrations, starts=starts)
         fixed = _adjusted(measured, calibrations, False)
@@ -367,6 +367,15 @@ def _spread(numbers: set[int], count: int) -> set[int]:
     ordered = sorted(numbers)
     count = min(count, len(ordered))
     return {ordered[i] for i in np.linspace(0, len(ordered) - 1, count).astype(int)}
+
+
+def _orienting(frames: Frames, phantom: Phantom) -> dict[str, list[Frame]]:
+    """Return the frames that can show the orientation of the rig."""
+    xyz = phantom.xyz_mm
+    return {
+        name: [f for f in exposures if orients(xyz[phantom.index(f.target_id)], xyz)]
+        for name, exposures in frames.items()
+    }
 
 
 def _paired(frames: Frames) -> dict[str, list[Frame]]:

@@ -41,8 +41,9 @@ from ..photogrammetry.adjustment import (
 )
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network, in_determined_datum
+from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.outliers import estimate_noise
+from ..photogrammetry.outliers import estimate_noise, mean_redundancy
 from ..photogrammetry.precision import (
     Precision,
     covariance_blocks,
@@ -446,6 +447,7 @@ def adjust_with_terms(
     correction = np.zeros_like(plain.uv)
     parameters = with_additional(before, terms.start()).parameters
     noise = before.noise
+    least_scale = 0.0  # of a noise of which the residuals say something
     converged = False
     for number in range(max_rounds):
         network = terms.with_additional(plain)
@@ -471,7 +473,12 @@ def adjust_with_terms(
             )
         blocks = covariance_blocks(matrix)
         projected = covariance_of_projection(network, result.parameters, blocks)
-        new_noise = estimate_noise(network, result, projected, matrix.information_factor)
+        if mean_redundancy(network, noise, projected) < MIN_REDUNDANCY:
+            least_scale = np.sqrt(2) * noise.scale
+            new_noise = replace(noise, scale=least_scale)
+        else:
+            estimated = estimate_noise(network, result, projected, matrix.information_factor)
+            new_noise = replace(estimated, scale=max(estimated.scale, least_scale))
         converged, coefficients = terms.renew(network, matrix, result)
         converged &= abs(new_noise.scale - noise.scale) <= terms.noise_tolerance * noise.scale
         parameters = replace(result.parameters, additional=coefficients)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..brief import brief_repr
 from ..errors import DataError
 from ..findings import Kind, too_few
+from ..rows import chosen_rows
 
 MIN_TARGETS = 4
 # Possible extent of what a fluoroscope sees: from a grid before the detector of a specimen scanner
@@ -49,6 +50,9 @@ class Phantom:
         Standard deviation of each coordinate [mm].
     diameter_mm : (n,) ndarray, optional
         Diameters of the beads [mm], if known.
+    part : (n,) ndarray of int, optional
+        Numbers of the parts that the beads belong to, if the phantom has several. Each part is
+        shown in exposures of its own, and its coordinates have a frame of their own.
     """
 
     __repr__ = brief_repr
@@ -57,6 +61,7 @@ class Phantom:
     xyz_mm: NDArray[np.float64]
     sd_mm: NDArray[np.float64]
     diameter_mm: NDArray[np.float64] | None = None
+    part: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         ids = np.asarray(self.target_id, dtype=np.int64)
@@ -70,6 +75,10 @@ class Phantom:
             if diameter.shape != sd.shape or not is_positive(diameter).all():
                 raise DataError('phantom: a diameter above 0 is needed for every target, or none')
             arrays.append(('diameter_mm', diameter))
+        if self.part is not None:
+            part = np.asarray(self.part, dtype=np.int64)
+            _validate_parts(part, len(ids))
+            arrays.append(('part', part))
         for name, values in arrays:
             ordered = values[order]
             ordered.setflags(write=False)
@@ -81,6 +90,32 @@ class Phantom:
             np.array_equal(self.target_id, other.target_id)
             and np.array_equal(self.xyz_mm, other.xyz_mm)
             and np.array_equal(self.sd_mm, other.sd_mm)
+        )
+
+    def parts(self) -> list[Phantom]:
+        """Return the parts, ordered by number; a phantom without parts is its only one."""
+        if self.part is None:
+            return [self]
+        return [chosen_rows(self, self.part == number) for number in np.unique(self.part)]
+
+    def with_part(self, other: Phantom) -> Phantom:
+        """Return the phantom with another one as a further part.
+
+        The ids of the other one are raised by the smallest power of ten above those of this one.
+        Diameters are kept if both have them.
+        """
+        power = 10 ** len(str(max(int(self.target_id.max()), 0)))
+        first = np.ones(len(self.target_id), np.int64) if self.part is None else self.part
+        added = np.full(len(other.target_id), first.max() + 1)
+        diameters = None
+        if self.diameter_mm is not None and other.diameter_mm is not None:
+            diameters = np.concatenate([self.diameter_mm, other.diameter_mm])
+        return Phantom(
+            np.concatenate([self.target_id, power + other.target_id]),
+            np.concatenate([self.xyz_mm, other.xyz_mm]),
+            np.concatenate([self.sd_mm, other.sd_mm]),
+            diameters,
+            np.concatenate([first, added]),
         )
 
     def index(self, target_id: ArrayLike) -> NDArray[np.intp]:
@@ -110,6 +145,18 @@ def _validate(ids: NDArray[np.int64], xyz: NDArray[np.float64], sd: NDArray[np.f
     repeated = first_repeated(ids)
     if repeated is not None:
         raise DataError(f'phantom: target {ids[repeated[0]]} is given twice')
+
+
+def _validate_parts(part: NDArray[np.int64], targets: int) -> None:
+    """Raise DataError for numbers of parts that are not one for each target, or small parts."""
+    if part.shape != (targets,):
+        raise DataError(f'phantom: {targets} target ids, but parts of shape {part.shape}')
+    numbers, count = np.unique(part, return_counts=True)
+    if count.min() < MIN_TARGETS:
+        raise DataError(
+            f'phantom: part {numbers[count.argmin()]} has {too_few(int(count.min()), "target")}, '
+            f'at least {MIN_TARGETS} are needed'
+        )
 
 
 def require_size(phantom: Phantom) -> None:

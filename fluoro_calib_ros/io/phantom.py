@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Phantom files: CSV `target_id,x,y,z,sd[,diameter]`, in millimetres.
+"""Phantom files: CSV `target_id,x,y,z,sd[,diameter][,part]`, in millimetres.
 
 Beads may have names instead of ids. Files of moving points have a further column `exposure`.
 """
@@ -20,6 +20,7 @@ from .csv_table import Block, NamedColumn, Table, read_all, read_blocks
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
 DIAMETER = 'diameter'  # diameter of the beads, optional
+PART = 'part'  # number of the part of the phantom, optional
 EXPOSURE = 'exposure'
 
 
@@ -46,9 +47,10 @@ def _read(path: PathLike, column: NamedColumn) -> Phantom:
     if len(ids) > max_targets:
         raise DataError(f'{path}: phantoms of more than {max_targets} targets are not read')
     diameters = rows.positive(DIAMETER) if DIAMETER in rows else None
+    part = rows.ids(PART) if PART in rows else None
     rows.require_different(ids, lambda row: f'target {ids[row]}')
     with ErrorsAt(path):
-        return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters)
+        return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters, part)
 
 
 def _numbers(rows: Block) -> np.ndarray:
@@ -90,13 +92,12 @@ def write_phantom(path: PathLike, phantom: Phantom, names: Names | None = None) 
     labels = (names or Names()).target_names()
     if not all(target in labels for target in phantom.target_id.tolist()):
         labels = {}
-    header: tuple[str, ...] = COLUMNS
-    columns = [*phantom.xyz_mm.T, phantom.sd_mm]
-    if phantom.diameter_mm is not None:
-        header = (*COLUMNS, DIAMETER)
-        columns.append(phantom.diameter_mm)
+    optional = {DIAMETER: phantom.diameter_mm, PART: phantom.part}
+    given = {name: values for name, values in optional.items() if values is not None}
+    columns = [*phantom.xyz_mm.T, phantom.sd_mm, *given.values()]
+    targets = phantom.target_id.tolist()
     rows = (
         [labels.get(target, target), *row]
-        for target, row in zip(phantom.target_id.tolist(), np.column_stack(columns).tolist())
+        for target, *row in zip(targets, *(column.tolist() for column in columns))
     )
-    Table(header, rows).write(path)
+    Table((*COLUMNS, *given), rows).write(path)

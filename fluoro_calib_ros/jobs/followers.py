@@ -26,6 +26,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place
 from ..images.extraction import Extraction, Nearby, extract_beads
 from ..images.following import Far, moved_on
+from ..images.lattice import FlatGrid
 from ..images.marker_decisions import Decision, EarlierImages, Retraction
 from ..images.marker_ids import identifiable, identify_markers
 from ..images.marker_views import MarkerViews, ViewsFrame
@@ -33,6 +34,7 @@ from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.matching import PhantomModel
 from ..images.overlay import draw_markers, draw_overlay
 from ..images.view import Lens, View, assumed_lens, lacks_certain_pose, shared_lens
+from ..photogrammetry.plane_resection import is_flat
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import OF_STREAM, WorkerProcess
 
@@ -64,6 +66,8 @@ class Observations:
     #: (h, w, 3), overlay of uint8 in BGR order, if requested
     picture: NDArray[np.uint8] | None = None
     seconds: float = 0.0
+    #: whether the targets are numbered from an arbitrary hole of a grid without a visible mark
+    is_unmarked: bool = False
 
     @property
     def reason(self) -> str:
@@ -88,9 +92,12 @@ class PhantomSettings:
         """Name of the fluoroscope, as a tuple."""
         return (self.fluoroscope,)
 
-    def __call__(self) -> PhantomFollower:
-        """Return a new PhantomFollower."""
-        return PhantomFollower(self)
+    def __call__(self) -> PhantomFollower | PartsFollower:
+        """Return a new follower, of the parts if the phantom has several."""
+        parts = self.phantom.parts()
+        if len(parts) == 1:
+            return PhantomFollower(self)
+        return PartsFollower([replace(self, phantom=part) for part in parts])
 
 
 class PhantomFollower:
@@ -204,6 +211,67 @@ class PhantomFollower:
             followed=extraction.followed,
             bent_px=extraction.bent_px,
         )
+
+
+class PartsFollower:
+    """Extracts the beads of a phantom with several parts, of which an image shows one.
+
+    The part of the previous image is tried first. If one of the parts is not flat, a grid without
+    a visible mark is accepted at any offset: the others determine the orientation.
+    """
+
+    def __init__(self, parts: Sequence[PhantomSettings]) -> None:
+        self._parts = [_FollowedPart.of(part) for part in parts]
+        if all(is_flat(part.phantom.xyz_mm) for part in parts):
+            self._parts = [replace(part, unmarked=None) for part in self._parts]
+
+    def extract(
+        self,
+        images: Mapping[str, np.ndarray],
+        number: int,
+        overlays: Collection[str] = (),
+        angles: Mapping[str, float | None] | None = None,
+    ) -> dict[str, Observations]:
+        """Return the observations in the images of an exposure; see PhantomFollower."""
+        (name,) = images
+        start = time.perf_counter()
+        tried = []
+        for part in list(self._parts):
+            observations = part.extract(images, number, overlays)[name]
+            tried.append(observations)
+            if observations.finding is None:
+                self._parts.remove(part)
+                self._parts.insert(0, part)
+                break
+        # If no part is found, the finding on the one that was found before is likely to help.
+        result = tried[-1] if tried[-1].finding is None else tried[0]
+        return {name: replace(result, seconds=time.perf_counter() - start)}
+
+
+@dataclass(frozen=True)
+class _FollowedPart:
+    """Follower of a part of a phantom; unmarked: another one that accepts its grid anywhere."""
+
+    follower: PhantomFollower
+    unmarked: PhantomFollower | None
+
+    @classmethod
+    def of(cls, settings: PhantomSettings) -> _FollowedPart:
+        """Return the followers of a part."""
+        is_grid = FlatGrid.of(settings.phantom.xyz_mm) is not None
+        anywhere = PhantomFollower(replace(settings, regular_grid=True)) if is_grid else None
+        return cls(PhantomFollower(settings), anywhere)
+
+    def extract(
+        self, images: Mapping[str, np.ndarray], number: int, overlays: Collection[str]
+    ) -> dict[str, Observations]:
+        """Return the observations in the images of an exposure; see PhantomFollower."""
+        ((name, observations),) = self.follower.extract(images, number, overlays).items()
+        finding = observations.finding
+        if finding is not None and finding.kind is Kind.POSE_AMBIGUOUS and self.unmarked:
+            observations = self.unmarked.extract(images, number, overlays)[name]
+            observations = replace(observations, is_unmarked=observations.finding is None)
+        return {name: observations}
 
 
 @lru_cache(maxsize=4)

@@ -34,6 +34,7 @@ from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import Frames
 from ..exposures.phantom import EXACT_SD_MM, MIN_TARGETS, Phantom
 from ..findings import Finding, Kind, Severity, too_few
+from ..rows import chosen_rows
 from .calibration import run_calibration
 
 
@@ -250,8 +251,7 @@ def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:
     surveyed_mm = np.round(beads.xyz_mm, 6)
     surveyed_sd = np.maximum(np.round(beads.sd_mm, 6), EXACT_SD_MM)
     if not request.keep_given:
-        diameter = None if given.diameter_mm is None else given.diameter_mm[row]
-        return Phantom(beads.target_id, surveyed_mm, surveyed_sd, diameter)
+        return replace(chosen_rows(given, row), xyz_mm=surveyed_mm, sd_mm=surveyed_sd)
     # Assume given coordinates as far off as those of surveyed beads were, if not more by their sd.
     deviation_mm = float(np.sqrt(np.mean(beads.off_mm**2) / 3))
     xyz = given.xyz_mm.copy()

@@ -331,3 +331,13 @@ def estimate_noise(
     unresolved = np.trace(projected, axis1=1, axis2=2) / (factor * variance)
     new = noise.estimate_from(adjustment.q * noise.scale**2, unresolved)
     return replace(new, scale=max(new.scale, MIN_NOISE_PX / float(np.median(network.sigma))))
+
+
+def mean_redundancy(network: Network, noise: Noise, projected: NDArray[np.float64]) -> float:
+    """Return the mean redundancy number of the image points.
+
+    projected: covariances of their projections, from covariance_of_projection. It vanishes if most
+    targets are seen once: then the object points follow the noise.
+    """
+    unresolved = np.trace(projected, axis1=1, axis2=2) / (noise.scale * network.sigma) ** 2
+    return 1 - float(np.mean(unresolved)) / 2

@@ -48,6 +48,11 @@ def flatness(xyz: NDArray[np.float64]) -> float:
     return float(extent[-1] / extent[0]) if extent[0] > 0 else 0.0
 
 
+def is_flat(xyz: NDArray[np.float64]) -> bool:
+    """Return whether targets (n, 3) nearly lie in a plane."""
+    return len(xyz) < 4 or flatness(xyz) < MIN_FLATNESS
+
+
 def plane_of(xyz: NDArray[np.float64]) -> Plane:
     """Return the plane that fits targets (n, 3) best. Raises DataError for targets on a line."""
     centre = xyz.mean(axis=0)

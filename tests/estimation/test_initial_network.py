@@ -205,10 +205,10 @@ def test_start_values_of_all_exposures_replace_resections():
 def test_numbers_of_exposures_and_targets_that_are_needed():
     known = {'b': object()}
     task = _Task(None, None, None, known)
-    assert [task.min_exposures('a'), task.min_exposures('b')] == [3, 1]
+    assert [task.min_exposures(name, []) for name in 'ab'] == [3, 1]
     given = replace(task, principal_distance=4000.0)
-    assert [given.min_exposures('a', True), given.min_exposures('a', False)] == [1, 3]
-    assert replace(task, sensors={}).min_exposures('a') == 1
+    assert [given.min_exposures('a', [], untilted) for untilted in (True, False)] == [1, 3]
+    assert replace(task, sensors={}).min_exposures('a', []) == 1
     assert [task.min_targets('a'), task.min_targets('b')] == [12, 1]
 
 

@@ -76,8 +76,8 @@ class ExtractionParameters(ManagedParameters):
     mode: str = option('phantom', 'what is extracted from the images', choices=MODES)
     phantom: str = option(
         '',
-        'file phantom.csv with the surveyed coordinates of the beads, with a column diameter where '
-        'their sizes differ, and a column part if each image shows one of several parts',
+        'file phantom.csv with the surveyed coordinates of the beads, with a column diameter '
+        'where their sizes differ, and a column part if each image shows one of several parts',
         unit='mm',
     )
     markers: str = option(

@@ -197,7 +197,7 @@ def run_extraction(
     results.sort(key=lambda result: result.exposure)
     angles = [result.frame.angle for result in results if result.frame is not None]
     notes: tuple[str | Finding, ...] = request.angles.note(request.fluoroscope, angles)
-    if request.regular_grid or any(result.is_unmarked for result in results):
+    if any(part.regular_grid for part in _task(request, (), None).settings.parts):
         notes = (NOT_MARKED, *notes)
     bent = bent_shadows(request.fluoroscope, results)
     if bent is not None:

@@ -66,8 +66,6 @@ class Observations:
     #: (h, w, 3), overlay of uint8 in BGR order, if requested
     picture: NDArray[np.uint8] | None = None
     seconds: float = 0.0
-    #: whether the targets are numbered from an arbitrary hole of a grid without a visible mark
-    is_unmarked: bool = False
 
     @property
     def reason(self) -> str:
@@ -92,12 +90,30 @@ class PhantomSettings:
         """Name of the fluoroscope, as a tuple."""
         return (self.fluoroscope,)
 
-    def __call__(self) -> PhantomFollower | PartsFollower:
-        """Return a new follower, of the parts if the phantom has several."""
+    @property
+    def parts(self) -> list[PhantomSettings]:
+        """Settings for each part of the phantom.
+
+        If one of several is not flat, grids are accepted at any offset: they serve the correction,
+        and the others determine the orientation.
+        """
         parts = self.phantom.parts()
         if len(parts) == 1:
-            return PhantomFollower(self)
-        return PartsFollower([replace(self, phantom=part) for part in parts])
+            return [self]
+        in_space = not all(is_flat(part.xyz_mm) for part in parts)
+        return [
+            replace(
+                self,
+                phantom=part,
+                regular_grid=in_space and FlatGrid.of(part.xyz_mm) is not None,
+            )
+            for part in parts
+        ]
+
+    def __call__(self) -> PhantomFollower | PartsFollower:
+        """Return a new follower, of the parts if the phantom has several."""
+        parts = self.parts
+        return PhantomFollower(self) if len(parts) == 1 else PartsFollower(parts)
 
 
 class PhantomFollower:
@@ -216,14 +232,11 @@ class PhantomFollower:
 class PartsFollower:
     """Extracts the beads of a phantom with several parts, of which an image shows one.
 
-    The part of the previous image is tried first. If one of the parts is not flat, a grid without
-    a visible mark is accepted at any offset: the others determine the orientation.
+    The part of the previous image is tried first.
     """
 
     def __init__(self, parts: Sequence[PhantomSettings]) -> None:
-        self._parts = [_FollowedPart.of(part) for part in parts]
-        if all(is_flat(part.phantom.xyz_mm) for part in parts):
-            self._parts = [replace(part, unmarked=None) for part in self._parts]
+        self._followers = deque(map(PhantomFollower, parts))
 
     def extract(
         self,
@@ -233,45 +246,20 @@ class PartsFollower:
         angles: Mapping[str, float | None] | None = None,
     ) -> dict[str, Observations]:
         """Return the observations in the images of an exposure; see PhantomFollower."""
-        (name,) = images
-        start = time.perf_counter()
-        tried = []
-        for part in list(self._parts):
-            observations = part.extract(images, number, overlays)[name]
-            tried.append(observations)
-            if observations.finding is None:
-                self._parts.remove(part)
-                self._parts.insert(0, part)
+        ((name, first),) = self._followers[0].extract(images, number, overlays).items()
+        seconds = first.seconds
+        result = first
+        for follower in list(self._followers)[1:]:
+            if result.finding is None:
                 break
-        # If no part is found, the finding on the one that was found before is likely to help.
-        result = tried[-1] if tried[-1].finding is None else tried[0]
-        return {name: replace(result, seconds=time.perf_counter() - start)}
-
-
-@dataclass(frozen=True)
-class _FollowedPart:
-    """Follower of a part of a phantom; unmarked: another one that accepts its grid anywhere."""
-
-    follower: PhantomFollower
-    unmarked: PhantomFollower | None
-
-    @classmethod
-    def of(cls, settings: PhantomSettings) -> _FollowedPart:
-        """Return the followers of a part."""
-        is_grid = FlatGrid.of(settings.phantom.xyz_mm) is not None
-        anywhere = PhantomFollower(replace(settings, regular_grid=True)) if is_grid else None
-        return cls(PhantomFollower(settings), anywhere)
-
-    def extract(
-        self, images: Mapping[str, np.ndarray], number: int, overlays: Collection[str]
-    ) -> dict[str, Observations]:
-        """Return the observations in the images of an exposure; see PhantomFollower."""
-        ((name, observations),) = self.follower.extract(images, number, overlays).items()
-        finding = observations.finding
-        if finding is not None and finding.kind is Kind.POSE_AMBIGUOUS and self.unmarked:
-            observations = self.unmarked.extract(images, number, overlays)[name]
-            observations = replace(observations, is_unmarked=observations.finding is None)
-        return {name: observations}
+            result = follower.extract(images, number, overlays)[name]
+            seconds += result.seconds
+            if result.finding is None:
+                self._followers.remove(follower)
+                self._followers.appendleft(follower)
+        # If no part is found, the finding on that of the previous image is likely to help.
+        result = first if result.finding is not None else result
+        return {name: replace(result, seconds=seconds)}
 
 
 @lru_cache(maxsize=4)

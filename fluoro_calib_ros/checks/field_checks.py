@@ -201,8 +201,16 @@ def check_trends(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     return checks
 
 
+def _not_compared(kind: Kind, evidence: Evidence, name: str) -> Check:
+    """Return the check that cannot be made because too few exposures can be compared."""
+    reason = 'too few exposures show beads in the same areas of the image'
+    return too_little_data(kind, name, reason, len(evidence.frames[name]))
+
+
 def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     trend = common.trend
+    if np.isinf(common.limit):
+        return _not_compared(Kind.WHITENESS, evidence, name)
     model = evidence.calibrations[name].model
     position = describe_place(trend.place, evidence.calibrations[name].image_size)
     return Check(
@@ -271,6 +279,8 @@ def _rejected_area(evidence: Evidence, name: str, rejected: RejectedArea) -> Che
 def _drift(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     size = evidence.calibrations[name].image_size
     change = change_of_trend(common.inliers, size)
+    if np.isinf(change.limit) and np.isinf(change.cell_limit):
+        return _not_compared(Kind.DRIFT, evidence, name)
     # The whole image decides, unless only the worst area has changed.
     is_of_image = change.size > change.limit or change.cell_size <= change.cell_limit
     return Check(

@@ -34,7 +34,7 @@ from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle, vector_from_matrix
-from .check import Check
+from .check import Check, not_made
 from .inputs import MAX_MISFIT
 
 # Distance, angle [rad] plus relative shift, above which a pair does not belong to the rig.
@@ -330,6 +330,9 @@ def check_rig(findings: RigFindings) -> list[Check]:
 def _check(findings: RigFindings, pairs: PairScatter, correction_px: float) -> Check:
     """Return the check of the scatter of the pairs of two fluoroscopes."""
     a, b = pairs.fluoroscopes
+    if len(pairs.off_px) < 2:
+        reason = f'fluoroscopes {a} and {b} have one exposure in common, which contradicts none'
+        return not_made(Kind.ORIENTATION, reason, place=Place((a, b), name=ORIENTED))
     off_px = float(np.median(pairs.off_px[pairs.used]))
     doubts = [doubt for doubt in findings.doubts if doubt.place.fluoroscopes == (a, b)]
     doubts = [doubt for doubt in doubts if doubt.kind in (Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED)]

@@ -192,7 +192,8 @@ class Functions:
         if self.modes:
             x_basis, y_basis = self._waves_of_both(x, y)
             i, j = self._sines.T - 1
-            np.multiply(x_basis[:, i], y_basis[:, j], out=out[:, self.trend :])
+            x_basis, y_basis = x_basis.take(i, axis=1), y_basis.take(j, axis=1)
+            np.multiply(x_basis, y_basis, out=out[:, self.trend :])
         return out
 
     def sums_of_sines(

@@ -313,7 +313,8 @@ class Elimination:
         by_other = by_other.reshape(*border.shape[:2], *self.layout.block_rows.shape)
         slot = self.cell[own] * self.n_places + self.place[own]
         by_other[slot, :, other, :] = pe.transpose(0, 2, 1) if self.of_exposures else pe
-        border[self._slot, :, self.layout.globals] = own_globals[:, :, self.network.layout.free]
+        columns = self.network.layout.free_columns
+        border[self._slot, :, self.layout.globals] = own_globals[:, :, columns]
         return border.reshape(self.n_cells, -1, self.layout.size)
 
     def _remaining_matrix(
@@ -333,7 +334,9 @@ class Elimination:
             a, b = (rows[exposures] for exposures in equations.coupled_pairs.T)
             out[a[:, :, None], b[:, None, :]] = equations.coupled
             out[b[:, :, None], a[:, None, :]] = equations.coupled.transpose(0, 2, 1)
-        out[blocks, border] = own_globals.reshape(rows.size, -1)[:, free]
+        out[blocks, border] = own_globals.reshape(rows.size, -1)[
+            :, self.network.layout.free_columns
+        ]
         out[border, blocks] = out[blocks, border].T
         out[border, border] = equations.gg[np.ix_(free, free)]
         return out
@@ -356,7 +359,7 @@ class Elimination:
         gg = np.zeros((size, size))
         gg[np.ix_(free, free)] = remaining[self.layout.globals, self.layout.globals]
         mixed = np.zeros((*rows.shape, size))
-        mixed[:, :, free] = remaining[self.layout.blocks, self.layout.globals].reshape(
+        mixed[:, :, self.network.layout.free_columns] = remaining[self.layout.blocks, self.layout.globals].reshape(
             *rows.shape, -1
         )
         return remaining[rows[:, :, None], rows[:, None, :]], gg, mixed
@@ -370,7 +373,7 @@ class Elimination:
         """
         shape = border.shape[:2]
         with_globals = np.zeros((*shape, self.network.layout.n_globals))
-        with_globals[:, :, self.network.layout.free] = border[:, :, self.layout.globals]
+        with_globals[:, :, self.network.layout.free_columns] = border[:, :, self.layout.globals]
         with_blocks = border[:, :, self.layout.blocks]
         return with_blocks.reshape(*shape, *self.layout.block_rows.shape), with_globals
 

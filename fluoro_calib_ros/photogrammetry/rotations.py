@@ -22,7 +22,7 @@ from scipy.linalg import cho_factor, lapack
 
 def mirror_lower(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the symmetric matrix (n, n) whose lower triangle is that of a matrix."""
-    return np.tril(matrix) + np.tril(matrix, -1).T
+    return np.where(np.tri(len(matrix), dtype=bool), matrix, matrix.T)
 
 
 def inverse_of_positive(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -36,7 +36,7 @@ is nothing to choose. Live, h is updated with the derivative of the likelihood o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -366,7 +366,7 @@ class MotionFilter:
     def smoothed(self) -> Motion:
         """Return the motion in the stored exposures, smoothed by all of them."""
         if self.lag != 0:
-            return _smooth(self.steps)[0]
+            return _smooth(self.steps)
         return Motion(
             self.rotation[None],
             self.mean[None, :, :3],
@@ -390,42 +390,53 @@ def _weigh(
     step.m = (m + np.swapaxes(m, 1, 2)) / 2
 
 
-def _smooth(steps: Sequence[_Step]) -> tuple[Motion, NDArray[np.float64]]:
-    """Smooth backwards over the steps of a filter.
-
-    Returns also derivatives of the log likelihood with respect to h, and their information, (2, T,
-    B, 2).
-    """
+def _backwards(
+    steps: Sequence[_Step],
+) -> Iterator[tuple[_Step, NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield the steps of a filter, the last one first, with r (B, 18) and N (B, 18, 18)."""
     count = len(steps[0].z)
-    rows = []
-    scores = []
     r = np.zeros((count, STATE))
     n = np.zeros((count, STATE, STATE))
     for step in reversed(steps):
         # r and n already contain L'F'r and L'F'N F L of the next step.
-        gain = step.covariance[:, :, POSE]
-        factor = _EYE_STATE - gain @ step.m @ _POSE_ROWS
+        factor = _EYE_STATE - step.covariance[:, :, POSE] @ step.m @ _POSE_ROWS
         transposed = np.swapaxes(factor, 1, 2)
         r = (transposed @ r[:, :, None])[:, :, 0]
         n = transposed @ n @ factor
         r[:, POSE] += step.z
         n[:, POSE, POSE] += step.m
+        yield step, r, n
+        forward = np.swapaxes(step.into, 1, 2)
+        r = (forward @ r[:, :, None])[:, :, 0]
+        n = forward @ n @ step.into
+
+
+def _smooth(steps: Sequence[_Step]) -> Motion:
+    """Smooth backwards over the steps of a filter."""
+    rows = []
+    for step, r, n in _backwards(steps):
         rotation, mean = _moved(step, (step.covariance @ r[:, :, None])[:, :, 0])
         turn = turn_of_twists(step.reference, rotation)
         covariance = _turned_covariance(_smoothed_covariance(step.covariance, n), turn)
         rows.append((rotation, mean[:, :3], mean[:, 6:12], mean[:, 12:], covariance))
+    log_q = np.stack([step.log_q for step in steps])
+    rotation, centre, velocity, acceleration, covariance = map(np.stack, zip(*rows[::-1]))
+    return Motion(rotation, centre, velocity, acceleration, covariance=covariance, log_q=log_q)
+
+
+def _scores(steps: Sequence[_Step]) -> NDArray[np.float64]:
+    """Return derivatives of the log likelihood with respect to h, and their information.
+
+    (2, T, B, 2), for the steps of a filter.
+    """
+    scores = []
+    for step, r, n in _backwards(steps):
         noise = _noise(step.dt_s, step.log_q)
         information = np.trace(noise @ n[:, None], axis1=2, axis2=3)
         squared = (r[:, None, None] @ noise @ r[:, None, :, None])[..., 0, 0]
         score = np.stack([0.5 * (squared - information), 0.5 * information])
         scores.append(np.where(step.started[:, None], 0, score))
-        forward = np.swapaxes(step.into, 1, 2)
-        r = (forward @ r[:, :, None])[:, :, 0]
-        n = forward @ n @ step.into
-    log_q = np.stack([step.log_q for step in steps])
-    rotation, centre, velocity, acceleration, covariance = map(np.stack, zip(*rows[::-1]))
-    motion = Motion(rotation, centre, velocity, acceleration, covariance=covariance, log_q=log_q)
-    return motion, np.stack(scores[::-1], axis=1)
+    return np.stack(scores[::-1], axis=1)
 
 
 def _moved(
@@ -500,18 +511,16 @@ def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion
     dt = np.array([step.dt_s for step in steps])
     log_q = np.stack([step.log_q for step in steps])
     walk = np.full(log_q.shape[1:], WALK)
-    motion, scores = _smooth(steps)
     for _ in range(12 if len(steps) > 1 else 0):  # one exposure shows no change
-        log_q, change, walk = _improved(log_q, scores, dt, walk)
+        log_q, change, walk = _improved(log_q, _scores(steps), dt, walk)
         follower = MotionFilter(len(first.alive), lag=None)
         for k, step in enumerate(steps):
             follower.predict(step.dt_s, log_q[k])
             follower.update(seen[k], step.started, adapt=False)
         steps = follower.steps
-        motion, scores = _smooth(steps)
         if change < ROUND_ENDS:
             break
-    return motion
+    return _smooth(steps)
 
 
 def _improved(
@@ -522,7 +531,7 @@ def _improved(
 ) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
     """Return log densities (T, B, 2) after a scoring step, its size, and walks (B, 2).
 
-    scores: as from `_smooth`.
+    scores: as from `_scores`.
     """
     out = log_q.copy()
     new_walk = walk.copy()

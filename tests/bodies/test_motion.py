@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.bodies.motion import (
     MotionFilter,
     PoseInformation,
-    _smooth,
+    _scores,
     _smoothed_covariance,
     _transition,
     noise_factors,
@@ -165,7 +165,7 @@ def test_derivatives_by_the_densities_are_those_of_the_likelihood():
         return cost, follower
 
     _, follower = run(log_q)
-    score = _smooth(follower.steps)[1][0, :, 0]
+    score = _scores(follower.steps)[0, :, 0]
     for k, kind in ((5, 0), (12, 1), (20, 0)):
         shifted = [log_q.copy() for _ in range(2)]
         for sign, h in zip((1, -1), shifted):

@@ -101,7 +101,8 @@ class EpipolarGeometry:
         sigma_a and sigma_b (n,), or a number for all: standard deviations of their coordinates
         [px].
         """
-        x_b, slope_a, slope_b, line_b, terms = self._slopes(uv_a, uv_b)
+        x_a, x_b = self._directions(uv_a, uv_b)
+        slope_a, slope_b = self._slopes(x_a, x_b)
         square_a = np.sum(slope_a * slope_a, axis=1)
         square_b = np.sum(slope_b * slope_b, axis=1)
         norm2 = square_a + square_b
@@ -109,9 +110,10 @@ class EpipolarGeometry:
         length_a = np.sqrt(square_a)
         length_b = np.sqrt(square_b)
         by_image = square_a * np.square(sigma_a) + square_b * np.square(sigma_b)
+        terms = _terms(x_a, x_b)
         by_rig = np.sum((terms @ self._covariance) * terms, axis=1)
         return EpipolarResiduals(
-            residual=np.sum(x_b * line_b, axis=1) / norm,
+            residual=np.sum(x_b * (x_a @ self.essential.T), axis=1) / norm,
             sd=np.sqrt(by_image / norm2),
             sd_total=np.sqrt((by_image + by_rig) / norm2),
             normal_a=slope_a / length_a[:, None],
@@ -120,25 +122,41 @@ class EpipolarGeometry:
             factor_b=length_b / norm,
         )
 
+    def misses(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
+        """Return the residuals (n,) of `residuals` [px] alone."""
+        x_a, x_b = self._directions(uv_a, uv_b)
+        slope_a, slope_b = self._slopes(x_a, x_b)
+        norm2 = np.sum(slope_a * slope_a, axis=1) + np.sum(slope_b * slope_b, axis=1)
+        return np.asarray(np.sum(x_b * (x_a @ self.essential.T), axis=1) / np.sqrt(norm2))
+
     def by_essential(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
         """Return derivatives (n, 9) of the residuals by the elements of E, by rows."""
-        _, slope_a, slope_b, _, terms = self._slopes(uv_a, uv_b)
+        x_a, x_b = self._directions(uv_a, uv_b)
+        slope_a, slope_b = self._slopes(x_a, x_b)
         norm = np.sqrt(np.sum(slope_a * slope_a + slope_b * slope_b, axis=1))
-        return np.asarray(terms / norm[:, None])
+        return np.asarray(_terms(x_a, x_b) / norm[:, None])
 
     def by_orientation(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
         """Return derivatives (n, 18) of the residuals by T, w, xp, yp, c of a and of b."""
         return np.asarray(self.by_essential(uv_a, uv_b) @ self._derivative)
 
-    def _slopes(self, uv_a: ArrayLike, uv_b: ArrayLike) -> tuple[NDArray[np.float64], ...]:
-        """Return directions (n, 3) in b, slopes (n, 2) in a and b, lines in b, terms (n, 9)."""
-        x_a = _directions(uv_a, self._interior[0])
-        x_b = _directions(uv_b, self._interior[1])
-        line_b = x_a @ self.essential.T
+    def _directions(
+        self, uv_a: ArrayLike, uv_b: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return directions (n, 3) of image points (n, 2) in a and in b."""
+        return _directions(uv_a, self._interior[0]), _directions(uv_b, self._interior[1])
+
+    def _slopes(
+        self, x_a: NDArray[np.float64], x_b: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return slopes (n, 2) in a and in b of the constraint at directions (n, 3)."""
         c_a, c_b = self._interior[:, 2]
-        # The constraint is linear in E; its nine terms are the products of the coordinates.
-        terms = (x_b[:, :, None] * x_a[:, None, :]).reshape(-1, 9)
-        return x_b, (x_b @ self.essential)[:, :2] / c_a, line_b[:, :2] / c_b, line_b, terms
+        return (x_b @ self.essential)[:, :2] / c_a, (x_a @ self.essential.T)[:, :2] / c_b
+
+
+def _terms(x_a: NDArray[np.float64], x_b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the terms (n, 9) of the constraint, which is linear in E: products of coordinates."""
+    return (x_b[:, :, None] * x_a[:, None, :]).reshape(-1, 9)
 
 
 def _directions(uv: ArrayLike, interior: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -524,12 +524,12 @@ class ViewsOfPair(Generic[AnyFrame]):
         points = joined_rows([self._no_points(), *parts])
         in_a, in_b = points.uv[:, 0], points.uv[:, 1:]
         sigma_a, sigma_b = points.sigma[:, 0], points.sigma[:, 1:]
-        found = [
-            self._geometry.residuals(in_a, in_b[:, lag], sigma_a, sigma_b[:, lag])
-            for lag in range(in_b.shape[1])
-        ]
-        present = found[self._most]
-        residual = np.column_stack([one.residual for one in found])
+        present = self._geometry.residuals(
+            in_a, in_b[:, self._most], sigma_a, sigma_b[:, self._most]
+        )
+        residual = np.column_stack(
+            [self._geometry.misses(in_a, of_lag) for of_lag in in_b.swapaxes(0, 1)]
+        )
         variance = present.factor_a**2 * points.noise[:, 0]
         variance += present.factor_b**2 * points.noise[:, 1 + self._most]
         columns = residual[:, self._most - 1 : self._most + 2]

@@ -308,6 +308,14 @@ def test_epipolar_distance_is_the_smallest_shift_that_makes_the_rays_meet():
     np.testing.assert_allclose(np.abs(other.residual), np.abs(distance.residual), rtol=1e-9)
 
 
+def test_residuals_alone_are_those_with_their_deviations():
+    orientation = orientation_of()
+    _, uv, sigma = seen(orientation, 4)
+    uv[1, 3] += 2.0
+    geometry = EpipolarGeometry(orientation, 'a', 'b')
+    np.testing.assert_array_equal(geometry.misses(*uv), geometry.residuals(*uv, *sigma).residual)
+
+
 def test_epipolar_nan_stays_nan():
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 4)

@@ -367,20 +367,18 @@ def _likelihood_of_sizes(
     """
     near = _neighbours(uv)
     size = size - np.median(size[near], axis=1)  # without the perspective
-    likelihoods = []
-    for slope in np.linspace(*SIZE_SLOPES):
-        level = response - slope * size
-        local_level = np.median(level[near], axis=1)
-        scatter = 1.4826 * np.median(np.abs(level[near] - local_level[:, None]), axis=1)
-        scatter = np.maximum(np.maximum(scatter, np.median(scatter)), 1e-6)
-        residual = np.abs(level - local_level) / scatter
-        outlier = residual > SIZE_TAIL
-        usual = (np.count_nonzero(outlier) + 1) / (len(uv) + 1)
-        share = (np.sum(outlier[near[:, 1:]], axis=1) + usual) / near.shape[1]
-        normal = np.exp(-0.5 * residual**2) / np.sqrt(2 * np.pi)
-        uniform = 0.5 / max(float(residual.max()), SIZE_TAIL)
-        likelihoods.append(np.sum(np.log(((1 - share) * normal + share * uniform) / scatter)))
-    return float(max(likelihoods))
+    level = response - np.linspace(*SIZE_SLOPES)[:, None] * size  # (slopes, n)
+    local_level = np.median(level[:, near], axis=2)
+    scatter = 1.4826 * np.median(np.abs(level[:, near] - local_level[:, :, None]), axis=2)
+    scatter = np.maximum(np.maximum(scatter, np.median(scatter, axis=1)[:, None]), 1e-6)
+    residual = np.abs(level - local_level) / scatter
+    outlier = residual > SIZE_TAIL
+    usual = (np.count_nonzero(outlier, axis=1) + 1) / (len(uv) + 1)
+    share = (np.sum(outlier[:, near[:, 1:]], axis=2) + usual[:, None]) / near.shape[1]
+    normal = np.exp(-0.5 * residual**2) / np.sqrt(2 * np.pi)
+    uniform = 0.5 / np.maximum(residual.max(axis=1), SIZE_TAIL)[:, None]
+    density = ((1 - share) * normal + share * uniform) / scatter
+    return float(np.sum(np.log(density), axis=1).max())
 
 
 def _neighbours(uv: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -226,16 +226,17 @@ def areas_of_rejected(
     if len(target) < FEW_TARGETS:
         return []
     cell = np.asarray(image_size) / CELLS
+    of_rejected, of_inliers = ((uv + 0.5) / cell for uv in (rejected.uv, inliers))
     corners = list(np.ndindex(2 * CELLS - 1, 2 * CELLS - 1))
     rate = len(target) / (len(target) + len(inliers))
     areas: list[_Area] = []
     clusters: list[_Area] = []
     for corner in corners:
-        rows = _inside(rejected.uv, np.array(corner) / 2, cell)
+        rows = _inside(of_rejected, np.array(corner) / 2)
         number = len(np.unique(target[rows]))
         if number < FEW_TARGETS:
             continue
-        total = len(rows) + len(_inside(inliers, np.array(corner) / 2, cell))
+        total = len(rows) + len(_inside(of_inliers, np.array(corner) / 2))
         by_chance = len(corners) * bdtrc(number - 1, total, rate)
         area = _Area.of(rejected, target, rows, clustered=bool(by_chance < CONTRADICTION))
         if number >= MIN_TARGETS:
@@ -248,12 +249,10 @@ def areas_of_rejected(
     ]
 
 
-def _inside(
-    uv: NDArray[np.float64], corner: NDArray[np.float64], cell: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Return rows of image points (n, 2) in a cell (2,) [px]; corner (2,): in units of cells."""
-    relative = (uv + 0.5) / cell - corner
-    return np.flatnonzero(((relative >= 0) & (relative < 1)).all(axis=1))
+def _inside(place: NDArray[np.float64], corner: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return rows of places (n, 2) in a cell with a corner (2,), both in units of cells."""
+    x, y = (place - corner).T  # `all` over an axis of two would be slow
+    return np.flatnonzero((x >= 0) & (x < 1) & (y >= 0) & (y < 1))
 
 
 @dataclass(frozen=True)

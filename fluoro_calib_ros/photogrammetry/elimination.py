@@ -354,14 +354,13 @@ class Elimination:
         """Split covariances of the remaining unknowns: (c, s, s), gg (G, G), mixed (c, s, G)."""
         remaining = covariance.remaining
         rows = self.layout.block_rows
-        free = self.network.layout.free
-        size = self.network.layout.n_globals
-        gg = np.zeros((size, size))
-        gg[np.ix_(free, free)] = remaining[self.layout.globals, self.layout.globals]
-        mixed = np.zeros((*rows.shape, size))
-        mixed[:, :, self.network.layout.free_columns] = remaining[self.layout.blocks, self.layout.globals].reshape(
-            *rows.shape, -1
-        )
+        layout = self.network.layout
+        gg = np.zeros((layout.n_globals, layout.n_globals))
+        gg[np.ix_(layout.free, layout.free)] = remaining[self.layout.globals, self.layout.globals]
+        mixed = np.zeros((*rows.shape, layout.n_globals))
+        mixed[:, :, layout.free_columns] = remaining[
+            self.layout.blocks, self.layout.globals
+        ].reshape(*rows.shape, -1)
         return remaining[rows[:, :, None], rows[:, None, :]], gg, mixed
 
     def _split_border(

@@ -140,6 +140,7 @@ def virtual_rig(
 
 EDGE_PX = IMAGE_SIZE[0] / 2  # the components of a field are given by their size there
 RIPPLES = 14  # number of ripples in a random field
+CHUNK = 2000  # pixels at once, for which the ripples of a field fit into the cache
 
 
 @dataclass(frozen=True)
@@ -163,11 +164,14 @@ class DistortionField:
         # S shape of each line: a cubic that fixes the centre and the point at 0.63.
         s = x[:, ::-1] * (x[:, ::-1] ** 2 - 0.4) / 0.6
         displacement = r2 * (self.pincushion * x + self.spiral * perpendicular) + self.s_shape * s
-        along_u, along_v = np.ascontiguousarray(uv.T)  # sums over an axis of two are slow
-        for u, v, width, height_u, height_v in self.ripples:
-            bump = np.exp(-((along_u - u) ** 2 + (along_v - v) ** 2) / (2 * width**2))
-            displacement[:, 0] += bump * height_u
-            displacement[:, 1] += bump * height_v
+        u, v, width, *heights = self.ripples.T[:, :, None]
+        for start in range(0, len(uv), CHUNK):
+            part = slice(start, start + CHUNK)
+            square = (uv[part, 0] - u) ** 2 + (uv[part, 1] - v) ** 2
+            bump = np.exp(-square / (2 * width**2))
+            for axis, height in enumerate(heights):
+                terms = np.concatenate([displacement[None, part, axis], bump * height])
+                displacement[part, axis] = np.add.reduce(terms, axis=0)
         return displacement
 
     def distort(self, uv: ArrayLike) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import DataError, printable, shortened
 from ..limits import ReadLimits, use_read_limits
+from ..report.versions import versions
 from . import (
     adjust,
     bag,
@@ -144,8 +145,6 @@ class _Print(argparse.Action):
 
 def _versions(*_: object) -> str:
     """Return the versions, which are looked up only on demand."""
-    from ..report.html import versions
-
     package_versions = versions()
     program_version = package_versions.pop('fluoro_calib_ros')
     dependencies = ', '.join(f'{name} {version}' for name, version in package_versions.items())

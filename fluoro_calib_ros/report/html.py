@@ -6,10 +6,8 @@
 from __future__ import annotations
 
 import base64
-import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +35,7 @@ from .report_figures import (
 from .residuals import Residuals, position_figure, residuals_of
 from .rig_geometry import SpaceAccuracy, beams, drawing, phantom_distance, uncalibrated_share
 from .tables import model_text
+from .versions import versions
 
 TEMPLATES = Path(__file__).parent / 'templates'
 VERDICTS = {
@@ -371,18 +370,3 @@ def _text(value: Any, digits: int = 3) -> str:
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return '–'
     return f'{float(value):.{digits}f}'
-
-
-PACKAGES = ('fluoro_calib_ros', 'numpy', 'scipy')
-FROM_SOURCE = 'from source'
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python, this package and its numerical libraries, by name."""
-    installed = {'Python': platform.python_version()}
-    for package in PACKAGES:
-        try:
-            installed[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            installed[package] = FROM_SOURCE
-    return installed

@@ -753,6 +753,13 @@ def test_version(capsys):
     assert re.match(r'fluoro_calib_ros \S.* \(Python 3\.\d+\.\d+', capsys.readouterr().out)
 
 
+def test_version_needs_no_library():
+    code = 'import sys; from fluoro_calib_ros.report import versions; versions.versions()'
+    code += '; print(*sys.modules)'
+    loaded = subprocess.check_output([sys.executable, '-c', code], text=True).split()
+    assert not {'numpy', 'matplotlib', 'jinja2'} & set(loaded)
+
+
 def test_output_of_any_name_is_told_on_any_terminal(result, tmp_path, monkeypatch, capsys):
     """The result is written; a terminal that cannot show its name gets it escaped."""
 

@@ -139,6 +139,15 @@ def check_rows(text: str, most: int, where: object) -> None:
         raise DataError(f'{where}: {rows} rows; the limit is {most}')
 
 
+def check_layout_version(path: object, version: object, last: int) -> None:
+    """Raise DataError for a file whose layout has no version from 1 to `last`."""
+    if version not in range(1, last + 1):
+        known = 'version 1' if last == 1 else f'versions 1 to {last}'
+        raise DataError(
+            f'{path}: the file has layout version {version}, this program reads {known}'
+        )
+
+
 def check_safe_name(name: str, where: object) -> None:
     """Raise DataError unless the name of a fluoroscope can be part of a file name.
 

@@ -24,7 +24,7 @@ import numpy as np
 from ..correction.calibration_record import Field
 from ..errors import DataError
 from ..limits import read_limits
-from .access import PathLike, atomic_file, read_bytes
+from .access import PathLike, atomic_file, check_layout_version, read_bytes
 
 _DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?')}
 
@@ -147,13 +147,7 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
         raise DataError(
             f'{path}: this is not {layout.content} file, its format_version is not an integer'
         )
-    if not 1 <= version <= layout.version:
-        last = layout.version
-        known_versions = 'version 1' if last == 1 else f'versions 1 to {last}'
-        raise DataError(
-            f'{path}: the file has layout version {int(version)}, this program reads '
-            f'{known_versions}'
-        )
+    check_layout_version(path, int(version), layout.version)
     return int(version)
 
 

@@ -22,7 +22,14 @@ from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..images.codec import JPEG_START
 from ..limits import MEGABYTE
-from .access import PathLike, check_safe_name, make_folder, read_bytes, write_bytes
+from .access import (
+    PathLike,
+    check_layout_version,
+    check_safe_name,
+    make_folder,
+    read_bytes,
+    write_bytes,
+)
 from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .csv_table import read_names, write_names
 from .documents import read_json, write_json
@@ -145,11 +152,7 @@ def read_calibrated_frames(directory: Path, calibrations: Calibrations) -> dict[
 def read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
     """Read the options of a calibration, whether it was joint, and its principal distance [px]."""
     document = read_json(_require_file(path))
-    if document.get('format_version') != VERSION:
-        raise DataError(
-            f'{path}: the file has layout version {document.get("format_version")}, this program '
-            f'reads version {VERSION}'
-        )
+    check_layout_version(path, document.get('format_version'), VERSION)
     try:
         options = CalibrationOptions(**document['options'])
     except (KeyError, TypeError, ValueError) as error:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...errors import DataError, ErrorsAt
 from ...exposures.names import Names, without_trivial
 from ...photogrammetry.rig_orientation import KnownOrientation
-from ..access import PathLike, read_text, write_text
+from ..access import PathLike, check_layout_version, read_text, write_text
 from ..bags.writer import write_bag
 from ..bodies import NAME_COLUMN
 from ..bodies import POINT_COLUMNS as POINTS
@@ -270,11 +270,7 @@ def read_known_orientations(path: PathLike) -> dict[str, KnownOrientation]:
     document = read_yaml(path)
     if not isinstance(document, Mapping) or not isinstance(document.get('fluoroscopes'), Mapping):
         raise DataError(f'{path}: there is no entry "fluoroscopes" with names and K, R, t_mm')
-    version = document.get('format_version', VERSION)
-    if version != VERSION:
-        raise DataError(
-            f'{path}: the file has layout version {version}, this program reads version {VERSION}'
-        )
+    check_layout_version(path, document.get('format_version', VERSION), VERSION)
     return {
         str(name): _orientation(entry, f'{path}, fluoroscope {name}')
         for name, entry in document['fluoroscopes'].items()

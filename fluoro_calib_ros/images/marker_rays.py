@@ -323,23 +323,28 @@ class MarkerBodies:
             out[rows] = np.count_nonzero(supported[rows]) >= MIN_MEMBERS
         return out
 
-    def miss(self, measured: NDArray[np.bool_], before: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mark bodies as lost if they are not at their expected places; return their markers (n,).
+    def miss(
+        self, measured: NDArray[np.bool_], before: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Mark bodies as lost if they are not at their expected places.
 
         measured, before (F, n): markers that are measured now, and in the last images of the same
-        views.
+        views. Return the markers (n,) of lost bodies, and those (F, n) of bodies that are not at
+        their expected places in a view.
         """
         out = np.zeros(self._count, dtype=bool)
+        by_view = np.zeros(measured.shape, dtype=bool)
         if self._tracker is None:
-            return out
+            return out, by_view
         lost = np.zeros(len(self._rows), dtype=bool)
         for number, rows in enumerate(self._rows):
-            expected = np.count_nonzero(before[:, rows])
-            seen = np.count_nonzero(measured[:, rows] & before[:, rows])
-            lost[number] = expected >= MIN_MEMBERS and seen < MIN_SEEN * expected
+            expected = before[:, rows].sum(axis=1)
+            seen = (measured & before)[:, rows].sum(axis=1)
+            lost[number] = _is_elsewhere(seen.sum(), expected.sum())
             out[rows] = lost[number]
+            by_view[:, rows] = _is_elsewhere(seen, expected)[:, None]
         self._tracker.lose(lost)
-        return out
+        return out, by_view
 
     def predicted(self, frame: int) -> MarkerPlaces:
         """Return the expected places of markers in the next exposure."""
@@ -428,6 +433,11 @@ class MarkerBodies:
                 changed = True
         if changed:
             self._tracker.reshape([_placed(body) for body in self._bodies])
+
+
+def _is_elsewhere(seen: NDArray[np.int64], expected: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return whether so few markers of bodies are seen that these have moved elsewhere."""
+    return np.asarray((expected >= MIN_MEMBERS) & (seen < MIN_SEEN * expected))
 
 
 def _placed(body: Body) -> Body:

@@ -228,14 +228,15 @@ class JoinedViews:
         measured_before = self._measured[rows]
         for view in views:
             self._measured[view.view] = np.isin(self._target_id, frames[view.name].target_id)
-        missed = self._bodies.miss(self._measured[rows], measured_before)
+        missed, by_view = self._bodies.miss(self._measured[rows], measured_before)
         if missed.any():
             self._next_search = 0
             self._pause = 1
         self._missed |= missed
         out = dict(frames)
-        for view in views:
-            view.doubt(np.flatnonzero(self._missed & self._measured[view.view]), frame)
+        for view, missed_here in zip(views, by_view):
+            doubted = (self._missed | missed_here) & self._measured[view.view]
+            view.doubt(np.flatnonzero(doubted), frame)
             doubtful = np.isin(frames[view.name].target_id, view.tracker.doubtful())
             out[view.name] = replace(frames[view.name], doubtful=doubtful)
         return out

@@ -20,6 +20,7 @@ from fluoro_calib_ros.images.marker_motion import MarkerStates, Motion
 from fluoro_calib_ros.images.marker_points import ShadowPoints, _explaining, shadow_points
 from fluoro_calib_ros.images.marker_rays import CalibratedRig, MarkerBodies, MarkerPlaces
 from fluoro_calib_ros.images.marker_views import JoinedViews, _later, _names, _ViewPredictions
+from fluoro_calib_ros.images.markers import MarkerFrame
 from fluoro_calib_ros.images.view import Lens
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -323,11 +324,57 @@ def test_a_body_of_which_less_than_half_is_seen_again_is_elsewhere():
     now = np.zeros((2, 9), dtype=bool)
     now[0, [0, 1, 4, 5, 6]] = True
     # Seen again: two of six; two of four, which is half (not counting a new marker); none of two.
-    assert np.flatnonzero(bodies.miss(now, before)).tolist() == [0, 1, 2]
+    missed, by_view = bodies.miss(now, before)
+    assert np.flatnonzero(missed).tolist() == [0, 1, 2]
+    # The second view sees none of the first body, and had seen only two of the second one.
+    assert [np.flatnonzero(view).tolist() for view in by_view] == [[], [0, 1, 2]]
     assert lost == [[True, False, False]]
-    assert not bodies.miss(now[:0], before[:0]).any()
+    missed, by_view = bodies.miss(now[:0], before[:0])
+    assert not missed.any() and by_view.shape == (0, 9)
     bodies._tracker = None
-    assert not bodies.miss(now, before).any()
+    missed, by_view = bodies.miss(now, before)
+    assert not missed.any() and by_view.shape == (2, 9) and not by_view.any()
+
+
+def test_what_a_view_still_measures_of_a_body_that_is_elsewhere_there_is_doubted():
+    doubted = {}
+    joined = JoinedViews.__new__(JoinedViews)
+    joined._target_id, joined._missed = np.arange(6), np.zeros(6, dtype=bool)
+    joined._measured = np.ones((2, 6), dtype=bool)
+    joined._bodies = Fake(
+        miss=lambda measured, before: (
+            np.zeros(6, dtype=bool),
+            np.array([[True] * 4 + [False] * 2, [False] * 6]),
+        )
+    )
+    joined._views = [
+        Fake(
+            view=view,
+            name=name,
+            tracker=Fake(doubtful=lambda name=name: doubted.get(name, [])),
+            doubt=lambda rows, frame, name=name: doubted.update({name: rows.tolist()}),
+        )
+        for view, name in enumerate('ab')
+    ]
+    frames = {'a': found_frame([2, 5]), 'b': found_frame(range(6))}
+    out = joined._without_missed(frames, 3)
+    assert doubted == {'a': [2], 'b': []}
+    assert out['a'].doubtful.tolist() == [True, False] and not out['b'].doubtful.any()
+
+
+def found_frame(target_id):
+    count = len(target_id)
+    return MarkerFrame(
+        3,
+        np.array(target_id),
+        np.zeros((count, 2)),
+        np.ones(count),
+        np.zeros(count, dtype=bool),
+        np.zeros(count, dtype=bool),
+        np.zeros(0, dtype=int),
+        np.zeros((0, 2)),
+        np.zeros(0, dtype=bool),
+    )
 
 
 @pytest.mark.parametrize('is_placed', [True, False])
@@ -341,7 +388,7 @@ def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
     joined._rays = Fake(intersect=lambda found, angles: Fake(sure=none, agree=none[None]))
     nowhere = MarkerPlaces.nowhere(2)
     joined._bodies = Fake(
-        miss=lambda measured, before: np.zeros(2, dtype=bool),
+        miss=lambda measured, before: (np.zeros(2, dtype=bool), np.zeros((0, 2), dtype=bool)),
         update=lambda exposure, frame: None,
         present=MarkerPlaces(np.zeros((2, 3)), nowhere.covariance) if is_placed else nowhere,
         unplaced=none.copy,

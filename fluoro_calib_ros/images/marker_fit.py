@@ -332,6 +332,7 @@ class MarkerMeasurement:
     def __init__(self, profile: Profile, noise: Noise, *, gate: float, shutter: float) -> None:
         self.profile = profile
         self._noise = noise
+        self.factor = 1.0  #: of the noise that other views show to that of the residuals
         self._inflation: dict[int, float] = {}
         self._gate = gate
         self._shutter = shutter
@@ -355,7 +356,7 @@ class MarkerMeasurement:
         uv = start.copy()
         uv[tried] = beads.uv
         sigma = np.full(len(start), SHADOW_SD_PX)
-        sigma[tried] = beads.sigma
+        sigma[tried] = self.factor * beads.sigma
         overlapped = np.zeros(len(start), dtype=bool)
         overlapped[tried] = beads.overlapped
         depth = states.depth.copy()

@@ -23,6 +23,7 @@ from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..findings import Kind
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.observed_noise import NoiseOfRays
 from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
 from .marker_ids import MAX_SHADOWS, find_bodies, identifiable
 from .marker_intensity import check_image
@@ -166,6 +167,9 @@ class JoinedViews:
         self._rig = rig
         self._rig_before = rig
         self._rays = MarkerRays(rig, target_id)
+        names = rig.orientation.fluoroscopes
+        widths = [rig.calibrations[name].image_size[0] for name in names]
+        self._noise = NoiseOfRays(rig.orientation, widths)
         self._bodies = MarkerBodies(rig.orientation, target_id, bodies)
         self._by_body = [BodyDecisions(view) for view in self._views]
         self._by_rays = [RayDecisions(view, self._rays) for view in self._views]
@@ -195,6 +199,7 @@ class JoinedViews:
     def decided(self, frames: Mapping[str, MarkerFrame], frame: int) -> ViewsFrame:
         """Return the markers of the views after decisions by the other views."""
         exposure = self._rays.intersect(self._without_missed(frames, frame), self._rig.angles)
+        self._observe_noise(exposure)
         self._bodies.update(exposure, frame)
         self._missed &= ~self._bodies.present.known  # their bodies have a pose again
         self._doubt_unsupported(exposure, frame)
@@ -240,6 +245,14 @@ class JoinedViews:
             doubtful = np.isin(frames[view.name].target_id, view.tracker.doubtful())
             out[view.name] = replace(frames[view.name], doubtful=doubtful)
         return out
+
+    def _observe_noise(self, exposure: MarkerExposure) -> None:
+        """Widen the standard deviations of the next exposures by the noise that rays show."""
+        views = exposure.intersected.views
+        trusted = exposure.agree & ~exposure.doubtful
+        self._noise.add(replace(views, uv=np.where(trusted[..., None], views.uv, np.nan)))
+        for view in self._views:
+            view.tracker.widen(self._noise.factor)
 
     def _doubt_unsupported(self, exposure: MarkerExposure, frame: int) -> None:
         """Doubt markers of bodies without a pose that no other view supports.

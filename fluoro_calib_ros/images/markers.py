@@ -304,6 +304,11 @@ class MarkerTracker:
         """Note that an id may be wrong."""
         self._known().doubts.add(self._row(target_id), frame)
 
+    def widen(self, factor: float) -> None:
+        """Multiply the standard deviations of the next measurements by a factor."""
+        if self._followed is not None:
+            self._followed.measurement.factor = factor
+
     def unsure(self) -> NDArray[np.int64]:
         """Return the ids (k,) of markers that were not measured last, or are doubtful."""
         followed = self._followed

@@ -26,9 +26,17 @@ from numpy.typing import NDArray
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Severity
-from ..photogrammetry.noise import CERTAIN, MEDIAN_SD, NORMAL_MEDIAN, SURE, trimmed_scale
+from ..photogrammetry.noise import (
+    CERTAIN,
+    MEDIAN_SD,
+    NORMAL_MEDIAN,
+    SURE,
+    WINDOW,
+    trimmed_scale,
+)
+from ..photogrammetry.rig_orientation import RigOrientation
 from .epipolar import EpipolarGeometry
-from .reconstruct import RigRecording, match_views
+from .reconstruct import MatchedViews, RigRecording, match_views
 
 MAX_PAIRS = 200  # pairs of consecutive exposures, evenly spread over a recording
 MIN_DIFFERENCES = 30
@@ -100,13 +108,47 @@ def _finding(factor: float, calibrations: Sequence[FluoroscopeCalibration]) -> F
 
 def _factor(pairs: Sequence[tuple[_Residuals, _Residuals]]) -> float:
     """Return the noise in consecutive exposures over the calibration's; 1 if unknown."""
-    differences = np.concatenate([_differences(*pair) for pair in pairs])
-    factor, count = trimmed_scale(differences / NORMAL_MEDIAN, CERTAIN / NORMAL_MEDIAN)
-    if count < MIN_DIFFERENCES:
+    factor, count = _scatter(np.concatenate([_differences(*pair) for pair in pairs]))
+    if not count:
         return 1.0
     # Each residual enters two differences.
     chance = 1 + SURE * MEDIAN_SD / np.sqrt(count / 2)
     return factor if factor > chance else 1.0
+
+
+class NoiseOfRays:
+    """Factor by which the rays of a stream of exposures scatter more than their sigma.
+
+    orientation: of the fluoroscopes. widths: of their images [px].
+    """
+
+    def __init__(self, orientation: RigOrientation, widths: Sequence[int]) -> None:
+        self._orientation = orientation
+        self._widths = widths
+        self.factor = 1.0  #: at least 1, for the standard deviations of the next exposure
+        self._last: _Residuals | None = None
+        self._differences = np.zeros(0)
+
+    def add(self, views: MatchedViews) -> None:
+        """Add an exposure whose standard deviations are those with the current factor."""
+        residuals = _residuals_of(views, self._orientation, self._widths)
+        if not len(residuals.value):
+            return
+        stated = residuals._replace(noise_sd=residuals.noise_sd / self.factor)
+        if self._last is not None:
+            new = _differences(self._last, stated)
+            self._differences = np.concatenate([self._differences, new])[-WINDOW:]
+            self.factor, _ = _scatter(self._differences)
+        self._last = stated
+
+
+def _scatter(differences: NDArray[np.float64]) -> tuple[float, int]:
+    """Return the scatter of differences (n,) over the expected one, at least 1, and their number.
+
+    Returns 1 and 0 if there are too few.
+    """
+    factor, count = trimmed_scale(differences / NORMAL_MEDIAN, CERTAIN / NORMAL_MEDIAN)
+    return (factor, count) if count >= MIN_DIFFERENCES else (1.0, 0)
 
 
 def _explains(factor: float, residuals: Sequence[_Residuals]) -> bool:
@@ -134,14 +176,22 @@ def _residuals(exposure: Mapping[str, Frame], recording: RigRecording) -> _Resid
     views = match_views(
         [recording.corrected(exposure[name]) if name in exposure else None for name in names]
     )
-    noise = np.sqrt(np.maximum(views.sigma**2 - views.correction_sd**2, 0.0))
     widths = [recording.calibrations[name].image_size[0] for name in names]
+    return _residuals_of(views, recording.orientation, widths)
+
+
+def _residuals_of(
+    views: MatchedViews, orientation: RigOrientation, widths: Sequence[int]
+) -> _Residuals:
+    """Return the epipolar residuals of all pairs of views of an exposure."""
+    names = orientation.fluoroscopes
+    noise = np.sqrt(np.maximum(views.sigma**2 - views.correction_sd**2, 0.0))
     parts = []
     for number, (a, b) in enumerate(combinations(range(len(names)), 2)):
         rows = np.flatnonzero(
             np.isfinite(views.uv[[a, b]]).all(axis=(0, 2)) & ~views.outside[[a, b]].any(axis=0)
         )
-        geometry = EpipolarGeometry(recording.orientation, names[a], names[b])
+        geometry = EpipolarGeometry(orientation, names[a], names[b])
         uv = views.uv[a, rows], views.uv[b, rows]
         by_noise = geometry.residuals(*uv, noise[a, rows], noise[b, rows])
         by_total = geometry.residuals(*uv, views.sigma[a, rows], views.sigma[b, rows])

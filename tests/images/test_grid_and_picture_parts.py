@@ -22,6 +22,7 @@ from fluoro_calib_ros.images.marker_rays import CalibratedRig, MarkerBodies, Mar
 from fluoro_calib_ros.images.marker_views import JoinedViews, _later, _names, _ViewPredictions
 from fluoro_calib_ros.images.markers import MarkerFrame
 from fluoro_calib_ros.images.view import Lens
+from fluoro_calib_ros.reconstruction.reconstruct import MatchedViews
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 RNG = np.random.default_rng(41)
@@ -385,7 +386,10 @@ def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
     joined._measured = np.zeros((0, 2), dtype=bool)
     joined._missed, joined._again = np.array([True, False]), []
     none = np.zeros(2, dtype=bool)
-    joined._rays = Fake(intersect=lambda found, angles: Fake(sure=none, agree=none[None]))
+    views = MatchedViews(joined._target_id, np.zeros((1, 2, 2)), *[none[None]] * 3)
+    seen = Fake(sure=none, agree=none[None], doubtful=none[None], intersected=Fake(views=views))
+    joined._rays = Fake(intersect=lambda found, angles: seen)
+    joined._noise = Fake(add=lambda views: None)
     nowhere = MarkerPlaces.nowhere(2)
     joined._bodies = Fake(
         miss=lambda measured, before: (np.zeros(2, dtype=bool), np.zeros((0, 2), dtype=bool)),

@@ -139,16 +139,30 @@ def followed_bodies() -> tuple[Body, ...]:
 
 
 @cache
-def followed_in_both(options: MarkerOptions = OPTIONS) -> tuple[ViewsFrame, ...]:
+def followed_in_both(
+    options: MarkerOptions = OPTIONS, jpeg: int | None = None
+) -> tuple[ViewsFrame, ...]:
+    """Follow the markers in both views, in images that were compressed with a JPEG quality."""
     _, images = sequence()
+    shown = [
+        {
+            name: image.image if jpeg is None else compressed(image.image, jpeg)
+            for name, image in of
+        }
+        for of in (of.items() for of in images)
+    ]
     calibrations, orientation = calibration()
     bodies = followed_bodies()
     first = {name: given(name) for name in 'ab'}
     views = MarkerViews(calibrations, orientation, options, first=first, bodies=bodies)
-    return tuple(
-        views.update({name: image.image for name, image in of.items()}, number)
-        for number, of in enumerate(images, 1)
-    )
+    return tuple(views.update(of, number) for number, of in enumerate(shown, 1))
+
+
+def compressed(image: np.ndarray, quality: int) -> np.ndarray:
+    """Return an image of 8 bits after compression."""
+    grey = np.rint(image * (255 / (2**MARKER_SETTINGS.bits - 1))).astype(np.uint8)
+    encoded = cv2.imencode('.jpg', grey, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
 
 
 def errors(name: str, frames: tuple[MarkerFrame, ...]) -> tuple[np.ndarray, ...]:
@@ -156,7 +170,7 @@ def errors(name: str, frames: tuple[MarkerFrame, ...]) -> tuple[np.ndarray, ...]
     ids, images = sequence()
     away = [
         found.uv - of[name].uv[np.searchsorted(ids, found.target_id)]
-        for found, of in zip(frames, images)
+        for found, of in zip(frames, images[-len(frames) :])
     ]
     return (
         np.concatenate(away),
@@ -196,6 +210,17 @@ def test_two_views_leave_no_wrong_id_and_hardly_a_doubt():
         assert not (np.linalg.norm(away, axis=1) > FAR_PX)[~doubtful].any()
         doubts.append(doubtful)
     assert np.concatenate(doubts).mean() < 0.05
+
+
+def test_rays_tell_how_precise_centres_are_in_images_that_were_compressed():
+    frames = followed_in_both(jpeg=9)
+    normalised = []
+    for name in 'ab':
+        away, sigma, _ = errors(name, tuple(found.views[name] for found in frames[10:]))
+        good = np.linalg.norm(away, axis=1) < FAR_PX
+        normalised.append(away[good] / sigma[good, None])
+    spread = np.sqrt(np.mean(np.concatenate(normalised) ** 2))
+    assert 0.8 < spread < 1.25
 
 
 def meeting(frame: int, turn: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -17,8 +17,8 @@ from fluoro_calib_ros.jobs.bodies import track_bodies
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.observed_noise import with_observed_noise
-from fluoro_calib_ros.reconstruction.reconstruct import RigRecording
+from fluoro_calib_ros.reconstruction.observed_noise import NoiseOfRays, with_observed_noise
+from fluoro_calib_ros.reconstruction.reconstruct import RigRecording, match_views
 from fluoro_calib_ros.simulation.rig import (
     StreamStart,
     image_frames,
@@ -97,6 +97,44 @@ def test_stated_sigma_holds():
     given['a'] = [replace(frame, sigma=np.full(len(frame.uv), 0.1)) for frame in given['a']]
     frames, found = observed(given)
     assert frames is given and found is None
+
+
+def factors(sigma, noise_px=0.2, names='ab', step=1):
+    """Factors on the standard deviations of the exposures of a stream, which follow them."""
+    _, calibrations, orientation = rig(names)
+    recording = RigRecording(
+        tracking(noise_px, names).frames, calibrations, Intersector(orientation)
+    )
+    noise = NoiseOfRays(orientation, [calibrations[name].image_size[0] for name in names])
+    out = []
+    for exposure in recording.exposures[::step]:
+        out.append(noise.factor)
+        noise.add(match_views([None] * len(names[1:]) + [recording.corrected(exposure['a'])]))
+        stated = [
+            replace(exposure[name], sigma=np.full(len(exposure[name].uv), sigma * noise.factor))
+            for name in names
+        ]
+        noise.add(match_views([recording.corrected(frame) for frame in stated]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize('names', ['ab', 'abc'])
+def test_rays_of_a_stream_tell_by_how_much_its_noise_is_larger_than_stated(names):
+    found = factors(0.1, names=names)
+    assert found[:2].tolist() == [1, 1]  # a difference needs two exposures
+    assert found[-1] == pytest.approx(2.0, rel=0.08)
+    assert found[40:] == pytest.approx(found[-1], rel=0.15)
+
+
+@pytest.mark.parametrize('sigma', [0.2, 0.4])
+def test_noise_of_a_stream_that_is_stated_or_less_widens_nothing(sigma):
+    found = factors(sigma)
+    assert found.max() < 1.25  # the scatter of few differences
+    assert found[40:] == pytest.approx(1.0, abs=0.05)
+
+
+def test_remote_exposures_of_a_stream_tell_nothing():
+    assert (factors(0.1, step=40) == 1).all()
 
 
 def test_few_or_remote_exposures_tell_nothing():

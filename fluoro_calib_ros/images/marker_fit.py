@@ -10,7 +10,7 @@ middle of the exposure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,6 +20,7 @@ from scipy.spatial.distance import cdist
 from .background import TERMS
 from .fine_grid import Absorbers, FineGrid
 from .light import MIN_PIXELS, Noise, line_of_variance
+from .marker_echo import Echo
 from .marker_intensity import LightWindows, Shadows
 from .marker_motion import SHADOW_SD_PX, MarkerStates, MeasuredMarkers, Motion, assign
 from .profile import Profile
@@ -60,6 +61,10 @@ class MarkerGuess:
     depth: NDArray[np.float64]
     depth_sd: NDArray[np.float64]
     motion: NDArray[np.float64]  #: (n, 2), motion of their shadows while the light is on [px]
+    #: (k, n, 2), centres in images before this one, latest first [px]
+    before: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    #: (k,), shares of these images in this one
+    echo: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def standing(cls, uv: NDArray[np.float64]) -> MarkerGuess:
@@ -75,7 +80,18 @@ def fit_markers(
     noise: Noise,
     inflation: dict[int, float],
 ) -> Beads:
-    """Measure all markers near their initial values at once.
+    """Measure all markers near their initial values at once; see `fitted`."""
+    return fitted(windows, guess, profile, noise, inflation).beads
+
+
+def fitted(
+    windows: LightWindows,
+    guess: MarkerGuess,
+    profile: Profile,
+    noise: Noise,
+    inflation: dict[int, float],
+) -> _MarkerFit:
+    """Return the fit of all markers near their initial values at once.
 
     inflation: factors on variances for correlated noise, by the number of pixels in a window. They
     are the same for all images, and new factors are added.
@@ -84,10 +100,10 @@ def fit_markers(
     pixels = len(fit.offset)
     fit.inflation = inflation.get(pixels)
     fit.run()
-    beads = fit.result()
+    fit.beads = fit.result()
     if fit.inflation is not None:
         inflation[pixels] = fit.inflation
-    return beads
+    return fit
 
 
 def noise_of_markers(
@@ -118,6 +134,8 @@ def _gauss_points(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]
 class _MarkerFit(ShadowFit):
     """Fit of markers of one size, which may move."""
 
+    beads: Beads
+
     def __init__(
         self, windows: LightWindows, guess: MarkerGuess, profile: Profile, noise: Noise
     ) -> None:
@@ -125,7 +143,8 @@ class _MarkerFit(ShadowFit):
         longest = float(length.max(initial=0.0))
         node, weight = _gauss_points(1 + round(longest / WAY_PX))
         self.way = 0.5 * node[:, None, None] * guess.motion  # (q, n, 2)
-        self.way_weight = 0.5 * weight
+        shares = np.append(1 - guess.echo.sum(), guess.echo)
+        self.way_weight = 0.5 * np.outer(shares, weight).ravel()
         reach = profile.reach_px + 0.5 * np.ceil(longest)
         super().__init__(
             SETTINGS,
@@ -179,6 +198,14 @@ class _MarkerFit(ShadowFit):
         self.background.terms[rows] = background
         return np.asarray(moved)
 
+    def _points(self, rows: NDArray[np.int64], middle: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return points (q, g, k, 2) of the paths of markers (g, k) in windows around a middle.
+
+        Those in this image come first.
+        """
+        places = self.uv, *self.guess.before
+        return np.concatenate([self.way[:, rows] + uv[rows] for uv in places]) - middle[:, None]
+
     def _shadow(
         self, rows: NDArray[np.int64], middle: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -187,8 +214,7 @@ class _MarkerFit(ShadowFit):
         The derivatives are with respect to the centres. rows (g, k) are the markers.
         """
         # Points along the path are the first axis; few large arrays are faster than many small.
-        centre = self.way[:, rows] + (self.uv[rows] - middle[:, None])
-        centre = centre.astype(DTYPE)
+        centre = self._points(rows, middle).astype(DTYPE)
         x = self.offset_u - centre[..., 0, None]
         y = self.offset_v - centre[..., 1, None]
         distance = x * x
@@ -198,15 +224,17 @@ class _MarkerFit(ShadowFit):
         derivative /= np.maximum(distance, 1e-9, out=distance)
         x *= derivative
         y *= derivative
-        if len(self.way) == 1:
+        if len(self.way_weight) == 1:
             return value[0], -x[0], -y[0]
         weight = self.way_weight.astype(DTYPE)
         point_count = len(weight)
         shape = value.shape[1:]
+        moving = weight.copy()
+        moving[len(self.way) :] = 0  # images before this one are over
         return (
             (weight @ value.reshape(point_count, -1)).reshape(shape),
-            (-weight @ x.reshape(point_count, -1)).reshape(shape),
-            (-weight @ y.reshape(point_count, -1)).reshape(shape),
+            (-moving @ x.reshape(point_count, -1)).reshape(shape),
+            (-moving @ y.reshape(point_count, -1)).reshape(shape),
         )
 
     def _model(
@@ -276,7 +304,7 @@ class _MarkerFit(ShadowFit):
         marker = np.where(there, members, 0)
         depth = self.depth[marker] * there
         beads = Absorbers(
-            self.way[:, marker] + (self.uv[marker] - self.middle[rows, None]),
+            self._points(marker, self.middle[rows]),
             self.way_weight,
             depth=depth,
             extent_px=np.full(marker.shape, self.profile.radius_px),
@@ -307,6 +335,40 @@ class _MarkerFit(ShadowFit):
         light, residual = np.concatenate(out, axis=1)
         return light, residual
 
+    def echoes(
+        self, before: NDArray[np.float64], measured: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return normal equations (k, k), (k,) of changes of the shares of earlier images.
+
+        before (k, n, 2): centres of the markers in these images. measured (n,): markers to use, if
+        they are isolated.
+        """
+        matrix = np.zeros((len(before),) * 2)
+        right = np.zeros(len(before))
+        shown = 0.5 * _gauss_points(len(self.way))[1]
+        for rows, near in self.groups:
+            if near.shape[1]:
+                continue
+            equations = self._equations((rows, near), True, None)
+            light, jacobian = self._model(rows, near)
+            residual, weight, _ = self._observed(rows, light)
+            usual = measured[rows] & (self.misfit[rows] <= DISTURBED * self.typical())
+            weight = weight * usual[:, None]
+            points = np.stack([self.way[:, rows] + uv[rows] for uv in (self.uv, *before)])
+            points = points[:, :, :, None] - self.middle[rows][:, None] - self.offset
+            shadow = self.profile.shadow(np.linalg.norm(points, axis=-1).astype(DTYPE))[0]
+            now, *earlier = np.tensordot(shadow, shown, (1, 0))
+            passed = self.background.direct(rows) * self.depth[rows, None]
+            by_share = np.stack([passed * (now - then) for then in earlier], axis=1)
+            absorbed = np.linalg.solve(
+                equations.matrix, equations.weighted @ np.swapaxes(by_share, 1, 2)
+            )
+            rest = by_share - np.swapaxes(absorbed, 1, 2) @ jacobian
+            matrix += ((by_share * weight[:, None]) @ np.swapaxes(rest, 1, 2)).sum(axis=0)
+            right += (rest @ (weight * residual)[..., None])[..., 0].sum(axis=0)
+        variance = self.typical() * (self.inflation or 1.0)
+        return matrix / variance, right / variance
+
     def result(self) -> Beads:
         """Return the measured markers."""
         displacement = np.abs(self.uv - self.start).max(axis=1, initial=0.0)
@@ -336,11 +398,17 @@ class MarkerMeasurement:
         self._inflation: dict[int, float] = {}
         self._gate = gate
         self._shutter = shutter
+        self._echo = Echo()
+
+    @property
+    def echo(self) -> NDArray[np.float64]:
+        """Shares (k,) of the images before, latest first, in the next image."""
+        return self._echo.shares
 
     def measure(
-        self, windows: LightWindows, shadows: Shadows, states: MarkerStates
+        self, windows: LightWindows, shadows: Shadows, states: MarkerStates, frames: int
     ) -> MeasuredMarkers:
-        """Measure the markers of an image in the shadows found in it."""
+        """Measure the markers of an image, `frames` after the last one, in its shadows."""
         start, assigned, free = self._assign(shadows, states)
         self._share_shadows(start, assigned, states.motion)
         tried = np.flatnonzero(assigned)
@@ -349,12 +417,18 @@ class MarkerMeasurement:
             states.depth[tried],
             states.depth_sd[tried],
             self._shutter * states.motion.velocity[tried],
+            before=self._echo.before(tried, states.motion, frames)[: len(self.echo)],
+            echo=self.echo,
         )
-        beads = fit_markers(windows, guess, self.profile, self._noise, self._inflation)
+        fit = fitted(windows, guess, self.profile, self._noise, self._inflation)
+        beads = fit.beads
         measured = np.zeros(len(start), dtype=bool)
         measured[tried[self._acceptable(beads, tried, states)]] = True
+        earlier = self._echo.before(tried, states.motion, frames)
+        self._echo.observe(*fit.echoes(earlier, measured[tried]), self.factor)
         uv = start.copy()
         uv[tried] = beads.uv
+        self._echo.add(np.where(measured[:, None], uv, np.nan))
         sigma = np.full(len(start), SHADOW_SD_PX)
         sigma[tried] = self.factor * beads.sigma
         overlapped = np.zeros(len(start), dtype=bool)

@@ -433,7 +433,7 @@ class MarkerTracker:
         if self._images:
             follow_beside(states, self._gap)
             shift_together(states, shadows, self.options.gate, self._gap)
-        markers = followed.measurement.measure(windows, shadows, states)
+        markers = followed.measurement.measure(windows, shadows, states, self._gap)
         unknown = ~states.motion.settled | (states.unseen > 1)
         markers, doubts = watch.shadows_met(markers, states, frame, is_first=self._images == 0)
         doubts += watch.recovered(markers, states, frame)

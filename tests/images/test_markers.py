@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -140,17 +141,20 @@ def followed_bodies() -> tuple[Body, ...]:
 
 @cache
 def followed_in_both(
-    options: MarkerOptions = OPTIONS, jpeg: int | None = None
+    options: MarkerOptions = OPTIONS, jpeg: int | None = None, lag: float = 0.0
 ) -> tuple[ViewsFrame, ...]:
-    """Follow the markers in both views, in images that were compressed with a JPEG quality."""
+    """Follow the markers in both views.
+
+    jpeg: quality with which the images were compressed. lag: share of the last result of a filter
+    in its next one.
+    """
     _, images = sequence()
-    shown = [
-        {
-            name: image.image if jpeg is None else compressed(image.image, jpeg)
-            for name, image in of
-        }
-        for of in (of.items() for of in images)
-    ]
+    shown = [{name: image.image for name, image in of.items()} for of in images]
+    for last, of in pairwise(shown):
+        for name, image in of.items():
+            of[name] = np.rint((1 - lag) * image + lag * last[name]).astype(image.dtype)
+    if jpeg is not None:
+        shown = [{name: compressed(of[name], jpeg) for name in of} for of in shown]
     calibrations, orientation = calibration()
     bodies = followed_bodies()
     first = {name: given(name) for name in 'ab'}
@@ -212,8 +216,9 @@ def test_two_views_leave_no_wrong_id_and_hardly_a_doubt():
     assert np.concatenate(doubts).mean() < 0.05
 
 
-def test_rays_tell_how_precise_centres_are_in_images_that_were_compressed():
-    frames = followed_in_both(jpeg=9)
+@pytest.mark.parametrize('processing', [{'jpeg': 9}, {'lag': 0.4}, {}])
+def test_centres_are_as_precise_as_their_sigma_says_in_processed_images(processing):
+    frames = followed_in_both(**processing)
     normalised = []
     for name in 'ab':
         away, sigma, _ = errors(name, tuple(found.views[name] for found in frames[10:]))

@@ -84,8 +84,8 @@ class MarkerWatch:
         out = []
         variance = motion.innovation_variance(markers.sigma)
         pairs = doubtful_pairs(motion.uv, variance, measured, markers.uv, self._margin)
-        # After the first image, exchanges cannot be recognised before a velocity is known.
-        settled = motion.settled | is_first
+        # Exchanges are only recognised where a place was given, or a velocity is known.
+        settled = motion.settled | is_first | (states.placed == 0)
         distances = np.linalg.norm(motion.uv[pairs[:, 0]] - motion.uv[pairs[:, 1]], axis=1)
         for (i, j), distance in zip(pairs.tolist(), distances.tolist()):
             both_settled = settled[i] and settled[j]

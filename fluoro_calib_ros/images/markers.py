@@ -261,8 +261,7 @@ class MarkerTracker:
         self._advance(frame)
         self._followed = start or followed
         given_rows = self._place_given()
-        markers, doubts = self._measure(image, frame)
-        doubts = self._believe(given_rows, markers, doubts)
+        markers, doubts = self._measure(image, frame, given_rows)
         none_seen = Finding(Kind.NO_MARKERS, 'no marker is seen')
         return self._result(markers, doubts, None if markers.measured.any() else none_seen, begin)
 
@@ -412,19 +411,28 @@ class MarkerTracker:
         return np.unique(np.concatenate(given))
 
     def _believe(
-        self, rows: NDArray[np.int64], measured: MeasuredMarkers, doubts: tuple[Finding, ...]
+        self, rows: NDArray[np.int64], doubts: tuple[Finding, ...]
     ) -> tuple[Finding, ...]:
-        """Revoke the doubts in markers whose places were given; return the remaining doubts."""
-        confirmed_rows = rows[measured.measured[rows]]
-        for row in confirmed_rows.tolist():
-            self._known().doubts.confirm(row)
-        ids = set(self.target_id[confirmed_rows].tolist())
-        return tuple(doubt for doubt in doubts if ids.isdisjoint(doubt.place.target_id))
+        """Revoke doubts that given markers are other objects; return the remaining doubts.
+
+        A place given to a pixel or two does not distinguish markers whose shadows meet there.
+        """
+        for row in rows.tolist():
+            self._known().doubts.confirm_alone(row)
+        ids = set(self.target_id[rows].tolist())
+        return tuple(
+            doubt
+            for doubt in doubts
+            if doubt.kind is Kind.SHADOWS_MET or ids.isdisjoint(doubt.place.target_id)
+        )
 
     def _measure(
-        self, image: np.ndarray, frame: int
+        self, image: np.ndarray, frame: int, given_rows: NDArray[np.int64]
     ) -> tuple[MeasuredMarkers, tuple[Finding, ...]]:
-        """Find and measure the markers of an image; return them with new doubts in their ids."""
+        """Find and measure the markers of an image; return them with new doubts in their ids.
+
+        given_rows: markers whose places are given for this image.
+        """
         followed = self._known()
         states = followed.states
         watch = followed.watch
@@ -434,6 +442,9 @@ class MarkerTracker:
             follow_beside(states, self._gap)
             shift_together(states, shadows, self.options.gate, self._gap)
         markers = followed.measurement.measure(windows, shadows, states, self._gap)
+        given_rows = given_rows[markers.measured[given_rows]]
+        for row in given_rows.tolist():
+            followed.doubts.confirm(row)
         unknown = ~states.motion.settled | (states.unseen > 1)
         markers, doubts = watch.shadows_met(markers, states, frame, is_first=self._images == 0)
         doubts += watch.recovered(markers, states, frame)
@@ -445,7 +456,7 @@ class MarkerTracker:
         doubts += watch.moving_alone(markers, states, frame, self._gap)
         sure = ~followed.doubts.doubtful
         self._led = states.motion.lead(states.unseen == 0, velocity_before, sure)
-        return markers, doubts
+        return markers, self._believe(given_rows, doubts)
 
     def _result(
         self,

@@ -282,15 +282,20 @@ def test_a_marker_is_put_where_a_person_sees_it_unless_it_is_there_anyway():
     assert one._place_given().tolist() == []
 
 
-def test_given_markers_that_are_measured_are_sure():
+def test_given_markers_that_are_measured_are_sure_unless_their_shadows_meet():
     one, _ = tracker()
     doubts = one._followed.doubts
     for row in range(3):
         doubts.add(row, 4)
-    told = tuple(Fake(place=Fake(target_id=ids)) for ids in ((3,), (5, 9), (9,)))
-    found = Fake(measured=np.array([True, True, False]))
-    left = one._believe(np.array([0, 2]), found, told)
+    kinds = Kind.OTHER_SHADOW, Kind.OTHER_SHADOW, Kind.MARKER_FOUND_AGAIN, Kind.SHADOWS_MET
+    ids = (3,), (5,), (9,), (3, 9)
+    told = tuple(Fake(kind=kind, place=Fake(target_id=of)) for kind, of in zip(kinds, ids))
+    left = one._believe(np.array([0]), told)
     assert left == told[1:] and doubts.doubtful.tolist() == [False, True, True]
+    doubts.add_pair(0, 2, 5)
+    one._believe(np.array([0]), told)
+    assert doubts.doubtful.tolist() == [True, True, True]
+    doubts.part(0, 2)
     assert one.doubtful().tolist() == [5, 9] and one.unsure().tolist() == [5, 9]
     assert one.doubted_since(5) == 4
     one.forget(9)

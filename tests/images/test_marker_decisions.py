@@ -510,6 +510,8 @@ def test_markers_whose_shadows_met_are_doubted_once_their_velocity_is_known():
         states.motion.covariance[0, 1, 1] = 36.0
         doubts.confirm(0)
         assert watch.shadows_met(found_frame(found), states, 9)[1] == ()
+        states.placed[:2] = 0  # their places are given for this image, to a pixel or two
+        assert [one.place.target_id for one in watch.shadows_met(found_frame(found), states, 9)[1]]
 
 
 @pytest.mark.parametrize(

@@ -309,7 +309,8 @@ def watched(uv, variance, unseen=None):
     watch = MarkerWatch(
         np.arange(len(uv)) + 10, doubts, gate=4.0, margin=6.0, lost_after=6, density=1e-4
     )
-    return watch, doubts, Fake(motion=motion, unseen=np.array(unseen or len(uv) * [0]))
+    unseen = np.array(unseen or len(uv) * [0])
+    return watch, doubts, Fake(motion=motion, unseen=unseen, placed=np.full(len(uv), 9))
 
 
 def found_at(uv, measured, free=(), shadow=None):

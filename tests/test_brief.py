@@ -14,7 +14,7 @@ def test_arrays_are_shown_by_their_shape_and_scalars_as_they_are():
     phantom = fc.Phantom(np.arange(1, 504), np.zeros((503, 3)), np.full(503, 0.1))
     assert repr(phantom) == (
         '<Phantom target_id=array(503,), xyz_mm=array(503, 3), sd_mm=array(503,), '
-        'diameter_mm=None>'
+        'diameter_mm=None, part=None>'
     )
     frame = fc.Frame('a', 7, np.array([1, 2]), np.array([[1 / 3, 2], [3, 4]]), (640, 480))
     shown = repr(frame)

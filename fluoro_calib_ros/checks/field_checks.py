@@ -23,7 +23,7 @@ from ..estimation.options import AUTO
 from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import angles_of
 from ..findings import Kind, Place, too_few
-from ..photogrammetry.noise import SURE
+from ..photogrammetry.noise import MIN_REDUNDANCY, SURE
 from .calibration_evidence import (
     MIN_VARYING_EXPOSURES,
     CommonTrend,
@@ -38,6 +38,9 @@ from .residual_tests import change_of_trend
 # Maximum ratio of the standard deviations of the correction and of an image coordinate.
 # Independent errors add in square: this ratio makes them 1.14 times those with known distortion.
 MAX_RATIO = 0.55
+# Share of the noise variance in the residuals below which the noise is only a bound: where they do
+# not show it, a calibration keeps their redundancy above MIN_REDUNDANCY, in steps of two.
+NOISE_SHOWN = 2 * MIN_REDUNDANCY
 
 
 def check_precision(evidence: Evidence, name: str) -> Check:
@@ -46,6 +49,11 @@ def check_precision(evidence: Evidence, name: str) -> Check:
     # Use the noise instead of residuals: these are smaller, as all unknowns follow the noise.
     noise = evidence.calibrations[name].image_sd
     count = len(evidence.frames[name])
+    if np.mean(np.square(evidence.calibrations[name].rmse_after)) < NOISE_SHOWN * noise**2:
+        reason = 'targets that are seen once do not show the image noise; the correction has a '
+        reason += f'standard deviation of {trends.claimed_sd:.3f} px'
+        check = too_little_data(Kind.PRECISION, name, reason, count)
+        return replace(check, numbers={**check.numbers, 'sd_px': trends.claimed_sd})
     advice = f'{more_exposures(count)}, or a phantom with more beads'
     if trends.trend.size > trends.trend.limit:
         # Distortion that a model cannot follow enlarges its residuals and its claimed sd.

@@ -41,9 +41,8 @@ from ..photogrammetry.adjustment import (
 )
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network, in_determined_datum
-from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.outliers import estimate_noise, mean_redundancy
+from ..photogrammetry.outliers import estimate_noise, shows_noise
 from ..photogrammetry.precision import (
     Precision,
     covariance_blocks,
@@ -473,12 +472,12 @@ def adjust_with_terms(
             )
         blocks = covariance_blocks(matrix)
         projected = covariance_of_projection(network, result.parameters, blocks)
-        if mean_redundancy(network, noise, projected) < MIN_REDUNDANCY:
-            least_scale = np.sqrt(2) * noise.scale
-            new_noise = replace(noise, scale=least_scale)
-        else:
+        if shows_noise(network, noise, projected):
             estimated = estimate_noise(network, result, projected, matrix.information_factor)
             new_noise = replace(estimated, scale=max(estimated.scale, least_scale))
+        else:
+            least_scale = np.sqrt(2) * noise.scale
+            new_noise = replace(noise, scale=least_scale)
         converged, coefficients = terms.renew(network, matrix, result)
         converged &= abs(new_noise.scale - noise.scale) <= terms.noise_tolerance * noise.scale
         parameters = replace(result.parameters, additional=coefficients)

@@ -333,11 +333,13 @@ def estimate_noise(
     return replace(new, scale=max(new.scale, MIN_NOISE_PX / float(np.median(network.sigma))))
 
 
-def mean_redundancy(network: Network, noise: Noise, projected: NDArray[np.float64]) -> float:
-    """Return the mean redundancy number of the image points.
+def shows_noise(network: Network, noise: Noise, projected: NDArray[np.float64]) -> bool:
+    """Return whether the residuals say something about the noise.
 
-    projected: covariances of their projections, from covariance_of_projection. It vanishes if most
-    targets are seen once: then the object points follow the noise.
+    projected: covariances of projections, from covariance_of_projection. If most targets are seen
+    once, their object points follow the noise within their survey.
     """
+    if network.datum != 'survey':
+        return True
     unresolved = np.trace(projected, axis1=1, axis2=2) / (noise.scale * network.sigma) ** 2
-    return 1 - float(np.mean(unresolved)) / 2
+    return 1 - float(np.mean(unresolved)) / 2 >= MIN_REDUNDANCY

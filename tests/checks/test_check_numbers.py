@@ -337,7 +337,7 @@ def test_cause_is_named_where_more_than_half_of_the_exposures_have_it(monkeypatc
 # ---- precision and the verdict
 
 
-def evidence(claimed=0.1, size=0.0, limit=0.05, sd=0.5, redundancy=0.5):
+def evidence(claimed=0.1, size=0.0, limit=0.05, sd=0.5, redundancy=0.5, shown=0.9):
     table = Fake(
         redundancy=np.array([redundancy, 9.0, 9.0]),
         fluoroscope=np.array(['a', 'a', 'b']),
@@ -345,7 +345,7 @@ def evidence(claimed=0.1, size=0.0, limit=0.05, sd=0.5, redundancy=0.5):
     )
     return Fake(
         trends={'a': Fake(claimed_sd=claimed, trend=Fake(size=size, limit=limit))},
-        calibrations={'a': Fake(image_sd=sd)},
+        calibrations={'a': Fake(image_sd=sd, rmse_after=np.full(2, shown * sd))},
         frames={'a': range(8)},
         result=Fake(residuals=table),
         request=Fake(options=Fake(model_name='auto')),
@@ -369,6 +369,12 @@ def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise)
     assert 'inf' not in str(found)
     growth = 100 * (np.hypot(1, ratio) - 1)
     assert (f'corrected points {growth:.0f} % larger' in found.cause) is bool(np.isfinite(ratio))
+
+
+def test_precision_is_unknown_where_residuals_do_not_show_the_noise():
+    found = field_checks.check_precision(evidence(shown=0.31), 'a')
+    assert found.passed is None and found.numbers['sd_px'] == pytest.approx(0.1)
+    assert field_checks.check_precision(evidence(shown=0.32), 'a').passed
 
 
 def trends_of(monkeypatch, change=None, rejected=None, model_name='auto', corrects=True):

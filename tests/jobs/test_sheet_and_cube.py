@@ -93,10 +93,10 @@ def test_a_sheet_and_a_cube_give_corrections_and_orientation():
     frames, phantom = exposures()
     outcome = run_calibration(CalibrationRequest(frames, phantom), validate=True)
     assert outcome.result.converged
-    assert outcome.validation.verdict != 'pass'
+    assert outcome.validation.verdict == 'cannot tell'
     made = {check.kind for check in outcome.validation.checks if check.passed is not None}
     compare = {Kind.HALVES, Kind.WHITENESS, Kind.DRIFT, Kind.VARIATION, Kind.ORIENTATION}
-    assert made.isdisjoint(compare)
+    assert made.isdisjoint({*compare, Kind.PRECISION})
     assert Kind.PAIRS_CONTRADICT not in kinds(outcome.result.findings)
     assert outcome.orientation.exposures == 1
     for calibration in outcome.result.calibrations.values():

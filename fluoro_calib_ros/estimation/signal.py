@@ -54,7 +54,7 @@ MIN_DETERMINED = 1e-3  # least number of determined coefficients in a sum
 # of three axes have all the weight and the most likely value has none.
 LONG_FIELD = [0, 1, 4]
 NODE = np.sqrt(3)
-NODE_TRIALS = 5  # most iterations for the distance of a node
+NODE_TRIALS = 8  # most iterations for the distance of a node
 NODE_TOLERANCE = 0.2  # tolerance of the logarithm of that distance
 MIN_RATIO = 0.1  # least ratio of that distance to the previous distance
 MIN_RISE = 1e-3  # least increase of the cost
@@ -305,14 +305,21 @@ def _node(
     room = np.where(step > 0, high - point, low - point)[step != 0] / step[step != 0]
     farthest = np.min([*room, FARTHEST / np.max(np.abs(step))])
     scale = min(1.0, farthest)
-    node = signal
+    node, closest = signal, np.inf
+    nearest, furthest = 0.0, np.inf  # scales between which the node is
     for _ in range(NODE_TRIALS):
-        node = _signal(point + scale * step, signal.ripples)
-        rise = max(_cost(node, coefficients) - cost, MIN_RISE)
-        ratio = max(NODE / np.sqrt(2 * rise), MIN_RATIO)  # zero if there is no likelihood
-        if abs(np.log(ratio)) < NODE_TOLERANCE or (ratio > 1 and scale == farthest):
+        tried = _signal(point + scale * step, signal.ripples)
+        rise = max(_cost(tried, coefficients) - cost, MIN_RISE)
+        ratio = NODE / np.sqrt(2 * rise)  # zero if there is no likelihood
+        off = abs(float(np.log(max(ratio, np.finfo(float).tiny))))
+        if off < closest:
+            node, closest = tried, off
+        if closest < NODE_TOLERANCE or (ratio > 1 and scale == farthest):
             break
-        scale = min(scale * ratio, farthest)
+        nearest, furthest = (scale, furthest) if ratio > 1 else (nearest, scale)
+        ahead = min(scale * max(ratio, MIN_RATIO), farthest)
+        inside = nearest < ahead < furthest
+        scale = ahead if inside else float(np.sqrt(nearest * furthest))
     return node
 
 

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.correction.terms import ABSENT_VARIANCE, trend_transformation
+from fluoro_calib_ros.estimation import signal as signal_module
 from fluoro_calib_ros.estimation.local_signal import (
     NODES,
     WIDTH,
@@ -570,3 +571,18 @@ def test_ripples_of_a_series_are_mean_squares_beyond_its_complete_bands():
         assert found.variances[band] == pytest.approx(np.mean(own**2))
     full = Functions(SIZE, 3, 12)
     assert ripples_of(full, np.ones((2, len(full)))) is None
+
+
+def test_a_plausible_signal_is_found_where_the_likelihood_first_grows_and_then_falls_steeply(
+    monkeypatch,
+):
+    """The search had cycled between a more likely signal and the end of the range."""
+    likely = Signal(4.0, 327.0, 1e-3, 200.0)
+
+    def cost(signal, _):
+        return 2000 * max(np.log(signal.reach / likely.reach) - 0.03, 0.0) ** 2 - 0.2
+
+    monkeypatch.setattr(signal_module, '_cost', cost)
+    step = np.array([0.0, 0.033, 0.0, 0.0, 0.0])
+    node = signal_module._node(likely, step, None, 0.0, 1024.0)
+    assert 1.5 * np.exp(-0.4) < cost(node, None) < 1.5 * np.exp(0.4)

@@ -246,20 +246,17 @@ class PartsFollower:
         angles: Mapping[str, float | None] | None = None,
     ) -> dict[str, Observations]:
         """Return the observations in the images of an exposure; see PhantomFollower."""
-        ((name, first),) = self._followers[0].extract(images, number, overlays).items()
-        seconds = first.seconds
-        result = first
-        for follower in list(self._followers)[1:]:
-            if result.finding is None:
-                break
-            result = follower.extract(images, number, overlays)[name]
-            seconds += result.seconds
-            if result.finding is None:
+        tried = []
+        for follower in list(self._followers):
+            ((name, observations),) = follower.extract(images, number, overlays).items()
+            tried.append(observations)
+            if observations.finding is None:
                 self._followers.remove(follower)
                 self._followers.appendleft(follower)
+                break
         # If no part is found, the finding on that of the previous image is likely to help.
-        result = first if result.finding is not None else result
-        return {name: replace(result, seconds=seconds)}
+        result = tried[-1] if tried[-1].finding is None else tried[0]
+        return {name: replace(result, seconds=sum(one.seconds for one in tried))}
 
 
 @lru_cache(maxsize=4)

@@ -396,3 +396,29 @@ def test_node_without_a_phantom_says_so(graph):
     node = graph.start('extraction_node', wait=False)
     assert node.wait() == 1
     assert 'parameter phantom is not set' in node.log and 'Traceback' not in node.log
+
+
+def test_each_image_shows_one_of_the_parts_of_a_phantom(module_graph, tmp_path):
+    solid = Phantom(np.arange(48) + 1, BEADS, np.full(48, 0.05))
+    other = Phantom(np.arange(24) + 1, OTHER_BEADS, np.full(24, 0.05))
+    write_phantom(tmp_path / 'both.csv', solid.with_part(other))
+    client = module_graph.client
+    client.listen('c/target_observations')
+    images = client.create_publisher(Image, 'c/image_raw', images_qos())
+    module_graph.start(
+        'extraction_node',
+        {
+            'phantom': tmp_path / 'both.csv',
+            'principal_distance': DISTANCE_PX,
+            'fluoroscopes': ['c'],
+        },
+    )
+    client.wait_until(images.get_subscription_count, what='the reader of images')
+    found = client.messages['c/target_observations']
+    for number, beads in enumerate((BEADS, OTHER_BEADS, BEADS), 1):
+        images.publish(raw(picture('a', number, beads), number, 'c'))
+        client.wait_until(lambda n=number: len(found) == n, JOB_DEADLINE, 'observations')
+    for message, of_other in zip(found, (False, True, False)):
+        ids = np.asarray(message.target_id)
+        assert len(ids) > 15
+        assert ((ids > 100) if of_other else (ids <= 48)).all()

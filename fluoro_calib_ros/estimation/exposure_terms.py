@@ -78,19 +78,23 @@ def exposure_functions(
     image_size: tuple[int, int],
     interior: NDArray[np.float64],
     with_interior: bool = False,
+    kind: GaugeKind = GaugeKind.FULL,
 ) -> NDArray[np.float64]:
     """Return values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and of RMS one.
 
     They are orthogonal to the gauge about interior (3,), which orientations absorb. with_interior:
     add three terms for a change of the interior orientation, which is the part of the gauge that a
-    rotation of the sensor does not absorb.
+    rotation of the sensor does not absorb. kind TREND: they complete the gauge to all cubic
+    polynomials, as the gauge of the series requires; the sum of a series and of orthogonal terms
+    could be a tilt, and nothing else determines the tilt of targets parallel to the image.
     """
     to_terms, count = trend_transformation(CUBIC)
     as_polynomials = np.linalg.inv(to_terms)[:, :count].reshape(2, -1, count)
     values = np.einsum('nm,amt->nat', Functions(image_size, CUBIC)(uv), as_polynomials)
     gauge = gauge_basis(uv, interior)
-    columns = np.concatenate([gauge, values], axis=2).reshape(2 * len(uv), -1)
-    q = np.linalg.qr(columns)[0][:, gauge.shape[2] :]
+    apart = gauge_basis(uv, interior, GaugeKind.NONE) if kind is GaugeKind.TREND else gauge
+    columns = np.concatenate([apart, values], axis=2).reshape(2 * len(uv), -1)
+    q = np.linalg.qr(columns)[0][:, apart.shape[2] :]
     if with_interior:
         turns = gauge_basis(uv, interior, GaugeKind.TURNS).reshape(2 * len(uv), -1)
         turns = np.linalg.qr(turns)[0]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ..photogrammetry.adjustment import Adjustment
-from .estimator import coefficients_of
+from .estimator import GaugeKind, coefficients_of
 from .exposure_terms import ExposureTerms, can_be_fitted, exposure_functions, variation
 from .fluoroscope_terms import FluoroscopeTerms
 from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
@@ -192,10 +192,11 @@ def exposure_terms(solution: Solution) -> Changes:
         has_few_exposures = len(np.unique(part.exposure)) <= MAX_VARYING_EXPOSURES
         if not shown.is_varying or not has_few_exposures:
             continue
-        if can_be_fitted(part.angles):
-            functions = exposure_functions(
-                part.uv, part.image_size, part.interior, with_interior=True
-            )
+        kind = GaugeKind.TREND if part.gauge_kind is GaugeKind.TREND else GaugeKind.FULL
+        with_interior = can_be_fitted(part.angles)
+        functions = exposure_functions(
+            part.uv, part.image_size, part.interior, with_interior, kind
+        )
         own = ExposureTerms(functions, part.exposure, shown.size_px)
         out[part.number] = Change(modes, own=own)
     return out if any(change.own is not None for change in out.values()) else {}
@@ -211,7 +212,7 @@ class AgreeingOutliers:
     """
 
     def __init__(self) -> None:
-        self._tried: dict[int, set[int]] = {}
+        self._tried: dict[int, NDArray[np.int64]] = {}
 
     def propose(self, solution: Solution) -> Changes:
         """See `Refinement`."""
@@ -220,11 +221,11 @@ class AgreeingOutliers:
             return out
         adjustment = solution.adjustment
         for part, current in zip(solution.parts, coefficients_of(adjustment)):
-            rows = _agreeing(part, adjustment)
-            tried = self._tried.setdefault(part.number, set())
-            if tried.issuperset(rows.tolist()):
+            tried = self._tried.get(part.number, np.zeros(0, dtype=int))
+            rows = _agreeing(part, adjustment, tried)
+            if not len(rows):
                 continue
-            tried.update(rows.tolist())
+            self._tried[part.number] = np.union1d(tried, rows)
             used = adjustment.inliers[part.rows]
             used[rows] = True
             modes = max(LOCAL_MODES, part.functions.complete)
@@ -239,13 +240,18 @@ class AgreeingOutliers:
         return out
 
 
-def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> NDArray[np.int64]:
-    """Return the rows, among those of a fluoroscope, of rejected image points that agree."""
+def _agreeing(
+    part: FluoroscopeTerms, adjustment: Adjustment, tried: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the rows, among those of a fluoroscope, of rejected image points that agree.
+
+    tried (k,): rows that are no evidence, because they were restored before.
+    """
     residuals = adjustment.residuals[part.rows]
     inliers = adjustment.inliers[part.rows]
     noise = adjustment.noise.scale * part.sigma
     is_small = np.sum(residuals**2, axis=1) < (LARGEST_SD * noise) ** 2
-    rejected = np.flatnonzero(~inliers & is_small)
+    rejected = np.setdiff1d(np.flatnonzero(~inliers & is_small), tried)
     points = FittedPoints(part.uv[rejected], residuals[rejected], part.exposure[rejected])
     areas = areas_of_rejected(points, part.point[rejected], part.uv[inliers], part.image_size)
     agreeing = [area.rows for area in areas if area.size_px > area.limit_px]

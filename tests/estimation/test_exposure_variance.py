@@ -14,7 +14,12 @@ from fluoro_calib_ros.correction.angle_field import harmonics
 from fluoro_calib_ros.correction.calibration_record import HARMONICS
 from fluoro_calib_ros.correction.series import Functions, sd_grid_pixels
 from fluoro_calib_ros.estimation.collocation import CollocationTerms
-from fluoro_calib_ros.estimation.estimator import AdjustmentProblem, GaugeKind, gauge_basis
+from fluoro_calib_ros.estimation.estimator import (
+    AdjustmentProblem,
+    GaugeKind,
+    gauge_basis,
+    gauge_coefficients,
+)
 from fluoro_calib_ros.estimation.exposure_terms import (
     VARYING,
     Effects,
@@ -399,6 +404,18 @@ def test_changes_of_the_interior_are_what_turns_do_not_absorb():
     whole = gauge_basis(uv, interior).reshape(600, -1)
     both = np.linalg.lstsq(np.hstack([turns, flat[:, 14:]]), whole, rcond=None)[0]
     np.testing.assert_allclose(np.hstack([turns, flat[:, 14:]]) @ both, whole, atol=1e-9)
+
+
+def test_terms_beside_a_series_in_the_gauge_of_its_trend_are_in_that_gauge():
+    """Otherwise a series and the terms of exposures could sum up to a tilt."""
+    uv = np.random.default_rng(13).uniform(0, 1024, (300, 2))
+    interior = np.array([511.5, 511.5, 4000.0])
+    for kind in (GaugeKind.FULL, GaugeKind.TREND):
+        functions = exposure_functions(uv, SIZE, interior, kind=kind)
+        flat = functions.reshape(600, 14)
+        np.testing.assert_allclose(flat.T @ flat / 600, np.eye(14), atol=1e-9)
+        parts = [gauge_coefficients(uv, f, interior, kind) for f in functions.transpose(2, 0, 1)]
+        np.testing.assert_allclose(parts, 0, atol=1e-9)
 
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t'])

@@ -9,6 +9,7 @@ import pytest
 
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.estimation import fluoroscope_terms
+from fluoro_calib_ros.estimation.estimator import GaugeKind
 from fluoro_calib_ros.estimation.exposure_terms import exposure_functions
 from fluoro_calib_ros.estimation.priors import Prior, SeriesEquations
 from fluoro_calib_ros.estimation.refinements import (
@@ -125,6 +126,7 @@ def test_exposures_get_terms_of_their_own_only_where_they_differ(varies):
         rows=np.arange(len(uv)),
         exposure=exposure,
         angles=np.full(6, np.nan),
+        gauge_kind=GaugeKind.FULL,
         functions=SimpleNamespace(complete=40),
     )
     adjustment = SimpleNamespace(inliers=np.ones(len(uv), bool), residuals=residuals)

@@ -567,6 +567,19 @@ def test_rejected_points_that_agree_are_followed_once():
     assert refinement.propose(there) == {}
 
 
+def test_points_that_were_restored_before_are_no_evidence_for_another():
+    near, terms, there = rejected_dent()
+    refinement = AgreeingOutliers()
+    assert refinement.propose(there)
+    network = terms.network
+    distance = np.linalg.norm(network.uv - np.median(network.uv, axis=0), axis=1)
+    residuals = there.adjustment.residuals.copy()
+    residuals[np.argmin(np.where(near, np.inf, distance))] = [3.0, -4.0]
+    again = solution_with(terms, network, there.adjustment, residuals)
+    assert np.sum(again.adjustment.inliers != there.adjustment.inliers) == 1
+    assert refinement.propose(again) == {}
+
+
 def test_rejected_points_far_beyond_any_correction_are_no_error_of_it():
     """They are off by forty standard deviations."""
     _, _, there = rejected_dent(far=True)
@@ -612,6 +625,7 @@ def test_terms_of_exposures_that_follow_an_angle_have_those_of_the_interior():
             rows=np.arange(len(uv)),
             exposure=numbers,
             angles=angles,
+            gauge_kind=GaugeKind.FULL,
             functions=SimpleNamespace(complete=modes),
         )
         adjustment = SimpleNamespace(inliers=np.ones(len(uv), bool), residuals=residuals)

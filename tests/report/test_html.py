@@ -303,7 +303,7 @@ def jpeg(grey):
     return encode(np.full((60, 80), grey, np.uint8), '.jpg', 80)
 
 
-def test_radiographs_are_embedded(folder, tmp_path, without_pictures):
+def test_radiographs_are_embedded(folder, tmp_path, text_only):
     copy = shutil.copytree(folder, tmp_path / 'result')
     numbers = sorted(f.number for f in read_report_input(copy).frames['a'])
     write_radiographs(copy, {'a': {n: jpeg(n % 250) for n in (*numbers[:2], 999)}})

@@ -75,7 +75,7 @@ def covered(of: MarkerImage, rows: slice | Sequence[int]) -> np.ndarray:
 # A rig of three fluoroscopes, with two bodies moving in front of it.
 
 THREE = 'abc'
-FRAMES = 24
+FRAMES = 19
 SEED = 26
 
 

@@ -77,7 +77,8 @@ def with_observed_noise(
     count = min(MAX_PAIRS, len(exposures) - 1)
     starts = np.unique(np.linspace(0, len(exposures) - 2, count).astype(int)).tolist()
     rows = {*starts, *(start + 1 for start in starts)}
-    residuals = {row: _residuals(exposures[row], recording) for row in rows}
+    geometries = _pairs_of_views(recording.orientation)
+    residuals = {row: _residuals(exposures[row], recording, geometries) for row in rows}
     factor = _factor([(residuals[start], residuals[start + 1]) for start in starts])
     if factor < MIN_FACTOR or (must_explain and not _explains(factor, list(residuals.values()))):
         return recording, None
@@ -123,7 +124,7 @@ class NoiseOfRays:
     """
 
     def __init__(self, orientation: RigOrientation, widths: Sequence[int]) -> None:
-        self._orientation = orientation
+        self._geometries = _pairs_of_views(orientation)
         self._widths = widths
         self.factor = 1.0  #: at least 1, for the standard deviations of the next exposure
         self._last: _Residuals | None = None
@@ -131,7 +132,7 @@ class NoiseOfRays:
 
     def add(self, views: MatchedViews) -> None:
         """Add an exposure whose standard deviations are those with the current factor."""
-        residuals = _residuals_of(views, self._orientation, self._widths)
+        residuals = _residuals_of(views, self._geometries, self._widths)
         if not len(residuals.value):
             return
         stated = residuals._replace(noise_sd=residuals.noise_sd / self.factor)
@@ -170,39 +171,45 @@ def _differences(one: _Residuals, other: _Residuals) -> NDArray[np.float64]:
     return np.asarray(np.abs(one.value[i] - other.value[j]) / sd)
 
 
-def _residuals(exposure: Mapping[str, Frame], recording: RigRecording) -> _Residuals:
+def _pairs_of_views(orientation: RigOrientation) -> list[EpipolarGeometry]:
+    return [
+        EpipolarGeometry(orientation, a, b) for a, b in combinations(orientation.fluoroscopes, 2)
+    ]
+
+
+def _residuals(
+    exposure: Mapping[str, Frame], recording: RigRecording, geometries: Sequence[EpipolarGeometry]
+) -> _Residuals:
     """Return the epipolar residuals of all pairs of views within the calibrated areas."""
     names = recording.fluoroscopes
     views = match_views(
         [recording.corrected(exposure[name]) if name in exposure else None for name in names]
     )
     widths = [recording.calibrations[name].image_size[0] for name in names]
-    return _residuals_of(views, recording.orientation, widths)
+    return _residuals_of(views, geometries, widths)
 
 
 def _residuals_of(
-    views: MatchedViews, orientation: RigOrientation, widths: Sequence[int]
+    views: MatchedViews, geometries: Sequence[EpipolarGeometry], widths: Sequence[int]
 ) -> _Residuals:
     """Return the epipolar residuals of all pairs of views of an exposure."""
-    names = orientation.fluoroscopes
     noise = np.sqrt(np.maximum(views.sigma**2 - views.correction_sd**2, 0.0))
     parts = []
-    for number, (a, b) in enumerate(combinations(range(len(names)), 2)):
+    for number, (a, b) in enumerate(combinations(range(len(widths)), 2)):
         rows = np.flatnonzero(
             np.isfinite(views.uv[[a, b]]).all(axis=(0, 2)) & ~views.outside[[a, b]].any(axis=0)
         )
-        geometry = EpipolarGeometry(orientation, names[a], names[b])
         uv = views.uv[a, rows], views.uv[b, rows]
-        by_noise = geometry.residuals(*uv, noise[a, rows], noise[b, rows])
-        by_total = geometry.residuals(*uv, views.sigma[a, rows], views.sigma[b, rows])
+        found = geometries[number].residuals(*uv, views.sigma[a, rows], views.sigma[b, rows])
+        noise_sd = np.hypot(found.factor_a * noise[a, rows], found.factor_b * noise[b, rows])
         pair = np.full(len(rows), number)
         parts.append(
             _Residuals(
                 np.column_stack([pair, views.target_id[rows]]),
                 np.column_stack([uv[0] / widths[a], uv[1] / widths[b]]),
-                by_noise.residual,
-                noise_sd=by_noise.sd,
-                other_sd=np.sqrt(np.maximum(by_total.sd_total**2 - by_noise.sd**2, 0.0)),
+                found.residual,
+                noise_sd=noise_sd,
+                other_sd=np.sqrt(np.maximum(found.sd_total**2 - noise_sd**2, 0.0)),
             )
         )
     return _Residuals(*(np.concatenate(values) for values in zip(*parts)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -120,14 +121,19 @@ def report_html(report: ReportInput, progress: Callable[[int, int], object] | No
 
 def page(template: str, **values: Any) -> str:
     """Render a template with values, the formatter of numbers `text`, and `versions`."""
-    environment = Environment(
+    return _templates().get_template(template).render(**values, versions=versions(), text=_text)
+
+
+@cache
+def _templates() -> Environment:
+    """Return the templates, each of which is compiled once in a process."""
+    return Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(**values, versions=versions(), text=_text)
 
 
 def _verdict(report: ReportInput) -> dict[str, Any]:

@@ -22,55 +22,69 @@ from fluoro_calib_ros.bodies.pose import (
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry.rotations import cross_matrix, vector_from_matrix
 
-UNKNOWN = Prediction(
-    np.eye(3)[None],
-    np.zeros((1, 3)),
-    np.eye(6)[None],
-    known=np.zeros(1, dtype=bool),
-    weak=np.ones(1, dtype=int),
-)
+
+def unknown(count):
+    """Return the prediction of bodies of which nothing is known."""
+    return Prediction(
+        np.tile(np.eye(3), (count, 1, 1)),
+        np.zeros((count, 3)),
+        np.tile(np.eye(6), (count, 1, 1)),
+        known=np.zeros(count, dtype=bool),
+        weak=np.ones(count, dtype=int),
+    )
+
+
+UNKNOWN = unknown(1)
 
 
 def random_pose(rng):
     return Rotation.from_rotvec(rng.normal(0, 0.5, 3)).as_matrix(), rng.uniform(-25, 25, 3)
 
 
-def error_of(found, rotation, centre):
-    """Errors (6,) of a pose: shift, and rotation about the axes of the rig."""
-    return np.concatenate(
-        [found.centre_mm[0] - centre, vector_from_matrix(found.rotation[0] @ rotation.T)]
-    )
+class Drawn:
+    """Bodies of random shapes and poses, which are solved in one exposure, each as if alone."""
 
+    def __init__(self, rng, count, markers, shape_sd=0.0):
+        self.bodies = [
+            body(rng, markers, f'body {i}', 1 + markers * i, shape_sd) for i in range(count)
+        ]
+        poses = [random_pose(rng) for _ in self.bodies]
+        self.rotation, self.centre = (np.array(part) for part in zip(*poses))
+        self.points = np.array(
+            [
+                (one.xyz_mm + rng.normal(0, shape_sd, (markers, 3)) - one.centre) @ r.T + c
+                for one, (r, c) in zip(self.bodies, poses)
+            ]
+        )
 
-def covariance_of(found):
-    by_rig = found.rig_root[0] @ found.rig_root[0].T
-    return found.covariance_noise[0] + found.covariance_fixed[0] + by_rig
+    def uv(self, rng, rig, px=0.2):
+        """Return noisy image points (F, count, markers, 2); errors of the rig for each body."""
+        root = rig.covariance_root()
+        return np.stack(
+            [project(rig, points, root @ rng.normal(size=len(root))) for points in self.points],
+            axis=1,
+        ) + rng.normal(0, px, (len(rig.fluoroscopes), *self.points.shape[:2], 2))
+
+    def solve(self, rig, uv, noise, reject=4.0, prediction=None):
+        ids = np.concatenate([one.target_id for one in self.bodies])
+        seen = exposure(rig, ids, uv.reshape(len(uv), -1, 2), noise, reject)
+        return PoseSolver(rig, self.bodies).solve(seen, prediction or unknown(len(self.bodies)))
+
+    def errors(self, centre, rotation):
+        """Errors (count, 6) of poses: shift, and rotation about the axes of the rig."""
+        turns = rotation @ np.swapaxes(self.rotation, 1, 2)
+        return np.column_stack([centre - self.centre, vector_from_matrix(turns)])
 
 
 def trials(rng, rig, count, markers=4, noise=Noise(), shape_sd=0.0):
     """Errors (count, 6) and covariances of random poses, with all errors drawn anew."""
-    root = rig.covariance_root()
-    errors = []
-    covariances = []
-    for _ in range(count):
-        given = body(rng, markers, sd=shape_sd)
-        true = given.xyz_mm + rng.normal(0, shape_sd, given.xyz_mm.shape)
-        rotation, centre = random_pose(rng)
-        points = (true - given.centre) @ rotation.T + centre
-        shift = rng.normal(0, noise.correction_px, (len(rig.fluoroscopes), markers, 2))
-        seen = observed(
-            rig,
-            given.target_id,
-            points,
-            rng,
-            Noise(noise.px, noise.correction_px, shift),
-            errors=root @ rng.normal(size=len(root)),
-        )
-        found = PoseSolver(rig, [given]).solve(seen, UNKNOWN)
-        assert found.alone[0]
-        errors.append(error_of(found, rotation, centre))
-        covariances.append(covariance_of(found))
-    return np.array(errors), np.array(covariances)
+    drawn = Drawn(rng, count, markers, shape_sd)
+    uv = drawn.uv(rng, rig, np.hypot(noise.px, noise.correction_px))
+    found = drawn.solve(rig, uv, noise)
+    assert found.alone.all()
+    by_rig = found.rig_root @ np.swapaxes(found.rig_root, 1, 2)
+    covariance = found.covariance_noise + found.covariance_fixed + by_rig
+    return drawn.errors(found.centre_mm, found.rotation), covariance
 
 
 def nse(errors, covariances):
@@ -130,61 +144,46 @@ def test_one_view_contributes_what_it_sees(view):
     rig = orientation()
     sd = np.array([2.0, 2, 2, 0.02, 0.02, 0.02])
     squares = []
-    for _ in range(100):
-        given = body(rng, 4)
-        rotation, centre = random_pose(rng)
-        points = (given.xyz_mm - given.centre) @ rotation.T + centre
-        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+    for _ in range(5):
+        drawn = Drawn(rng, 20, 4)
+        uv = drawn.uv(rng, rig)
         uv[1 - view] = np.nan
-        away = rng.normal(0, sd)
-        prediction = Prediction(
-            (Rotation.from_rotvec(away[3:]).as_matrix() @ rotation)[None],
-            (centre + away[:3])[None],
-            np.diag(sd**2)[None],
-            known=np.ones(1, dtype=bool),
-            weak=np.ones(1, dtype=int),
+        away = rng.normal(0, sd, (20, 6))
+        prediction = replace(
+            unknown(20),
+            rotation=Rotation.from_rotvec(away[:, 3:]).as_matrix() @ drawn.rotation,
+            centre_mm=drawn.centre + away[:, :3],
+            covariance=np.tile(np.diag(sd**2), (20, 1, 1)),
+            known=np.ones(20, dtype=bool),
         )
-        found = PoseSolver(rig, [given]).solve(
-            exposure(rig, given.target_id, uv, Noise(0.2)), prediction
-        )
-        told = found.information
-        error = np.concatenate(
-            [
-                told.centre_mm[0] - centre,
-                vector_from_matrix(told.rotation[0] @ rotation.T),
-            ]
-        )
-        # At the linearisation point, the data pull by `right`, in balance with the prediction.
-        normal = told.normal[0]
-        values, vectors = np.linalg.eigh(normal)
-        seen = values > 1e-3 * values.max()
-        missing = (vectors.T @ (told.right[0] - normal @ -error))[seen] / np.sqrt(values[seen])
-        squares.append(np.mean(missing**2))
+        found = drawn.solve(rig, uv, Noise(0.2), prediction=prediction)
         assert np.isfinite(found.covariance_fixed).all()
+        told = found.information
+        for normal, right, error in zip(
+            told.normal, told.right, drawn.errors(told.centre_mm, told.rotation)
+        ):
+            # At the linearisation point, the data pull by `right`, in balance with the prediction.
+            values, vectors = np.linalg.eigh(normal)
+            seen = values > 1e-3 * values.max()
+            missing = (vectors.T @ (right - normal @ -error))[seen] / np.sqrt(values[seen])
+            squares.append(np.mean(missing**2))
     assert np.mean(squares) == pytest.approx(1, abs=0.25)
 
 
 def test_false_marker_is_found_and_the_others_stay():
     rng = np.random.default_rng(4)
     rig = orientation()
-    wrong = 0
-    for _ in range(60):
-        given = body(rng, 5)
-        rotation, centre = random_pose(rng)
-        points = (given.xyz_mm - given.centre) @ rotation.T + centre
-        uv = project(rig, points) + rng.normal(0, 0.2, (2, 5, 2))
-        row = int(rng.integers(5))
-        uv[:, row] += rng.normal(0, 10, (2, 2))
-        found = PoseSolver(rig, [given]).solve(
-            exposure(rig, given.target_id, uv, Noise(0.2), reject=None), UNKNOWN
-        )
-        right = not found.used[0, row] and found.used[0].sum() == 4
-        wrong += not right
-        if right:
-            assert found.test[0, row] > 1
-            error = error_of(found, rotation, centre)
-            assert np.linalg.norm(error[:3]) < 0.5
-    assert wrong <= 3
+    drawn = Drawn(rng, 60, 5)
+    uv = drawn.uv(rng, rig)
+    bodies = np.arange(60)
+    row = rng.integers(5, size=60)
+    uv[:, bodies, row] += rng.normal(0, 10, (2, 60, 2))
+    found = drawn.solve(rig, uv, Noise(0.2), reject=None)
+    right = ~found.used[bodies, row] & (found.used.sum(axis=1) == 4)
+    assert np.count_nonzero(~right) <= 3
+    assert (found.test[bodies, row][right] > 1).all()
+    shift = found.centre_mm - drawn.centre
+    assert (np.linalg.norm(shift[right], axis=1) < 0.5).all()
 
 
 def differences(function, size, step):
@@ -247,34 +246,19 @@ def test_false_marker_is_found_beside_errors_of_the_rig():
 
 def test_true_markers_are_kept():
     rng = np.random.default_rng(5)
-    rig = orientation()
-    kept = []
-    for _ in range(150):
-        given = body(rng, 6)
-        rotation, centre = random_pose(rng)
-        points = (given.xyz_mm - given.centre) @ rotation.T + centre
-        found = PoseSolver(rig, [given]).solve(
-            observed(rig, given.target_id, points, rng), UNKNOWN
-        )
-        kept.append(found.used.sum())
-    assert sum(kept) >= 150 * 6 - 3  # 1 of 16,000 markers exceeds four standard deviations
+    drawn = Drawn(rng, 150, 6)
+    found = drawn.solve(orientation(), drawn.uv(rng, orientation()), Noise())
+    assert found.used.sum() >= 150 * 6 - 3  # 1 of 16,000 markers exceeds four standard deviations
 
 
 def test_markers_that_contradict_each_other_by_far_leave_a_frame_without_a_pose():
     """Precise markers that all disagree are excluded until the pose is singular."""
     rng = np.random.default_rng(9)
-    rig = orientation()
-    left = []
-    for _ in range(60):
-        given = body(rng, 4)
-        rotation, centre = random_pose(rng)
-        points = (given.xyz_mm - given.centre) @ rotation.T + centre
-        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
-        seen = exposure(rig, given.target_id, uv, Noise(0.005), reject=None)
-        found = PoseSolver(rig, [given]).solve(seen, UNKNOWN)
-        assert np.isfinite(found.rotation).all() == found.alone[0]
-        left.append(found.used.sum())
-    assert np.count_nonzero(np.array(left) < 3) > 40
+    drawn = Drawn(rng, 60, 4)
+    uv = drawn.uv(rng, orientation())
+    found = drawn.solve(orientation(), uv, Noise(0.005), reject=None)
+    assert (np.isfinite(found.rotation).all(axis=(1, 2)) == found.alone).all()
+    assert np.count_nonzero(found.used.sum(axis=1) < 3) > 40
 
 
 def test_two_markers_give_no_pose_alone():
@@ -353,15 +337,7 @@ def test_bodies_are_solved_as_one_by_one():
         [one.xyz_mm - one.centre + [30 * k, 0, 0] for k, one in enumerate(bodies)]
     )
     seen = observed(rig, ids, points, rng)
-    count = len(bodies)
-    unknown = Prediction(
-        np.tile(np.eye(3), (count, 1, 1)),
-        np.zeros((count, 3)),
-        np.tile(np.eye(6), (count, 1, 1)),
-        known=np.zeros(count, dtype=bool),
-        weak=np.ones(count, dtype=int),
-    )
-    together = PoseSolver(rig, bodies).solve(seen, unknown)
+    together = PoseSolver(rig, bodies).solve(seen, unknown(len(bodies)))
     for row, one in enumerate(bodies):
         alone = PoseSolver(rig, [one]).solve(seen, UNKNOWN)
         assert together.centre_mm[row] == pytest.approx(alone.centre_mm[0], abs=1e-9)

@@ -5,6 +5,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -59,7 +60,8 @@ def run(tmp_path):
 
 def test_commands_need_no_function_that_windows_lacks(run, tmp_path):
     out = tmp_path / 'result'
-    write_bag(tmp_path / 'few', {'a': exposures(5)['a']})
+    few = [replace(f, target_id=f.target_id[::3], uv=f.uv[::3]) for f in exposures(5)['a']]
+    write_bag(tmp_path / 'few', {'a': few})
     words = (tmp_path / 'few', '--phantom', BAGS / 'phantom.csv', '--fluoroscopes', 'a')
     run(COMMANDS, 'calibrate', *words, '--fast', '--out', out)
     assert load_calibrations(out)['a'].model.kind == 'parametric'

@@ -584,13 +584,14 @@ def test_frame_that_does_not_fit_the_phantom_is_left_out_and_reported():
     """So is a frame with too few targets; the result equals that without both frames."""
     frames = frames_of(count=8)['a']
     spoilt = frames[:3] + [shuffled_ids(frames[3])] + frames[4:7] + [cut(frames[7], 9)]
-    job = calibrate({'a': spoilt}, PHANTOM, rounds(1))
+    job = calibrate({'a': spoilt}, PHANTOM, rounds(1, model='none'))
     few, poor = job.findings
     assert few.kind is Kind.FEW_TARGETS and few.place == Place(('a',), (8,))
     assert few.numbers == {'targets': 9, 'needed': 12}
     assert poor.kind is Kind.POOR_FIT and poor.place == Place(('a',), (4,))
     assert [e.exposure for e in job.fluoroscopes['a'].exposures] == [1, 2, 3, 5, 6, 7]
-    without = calibrate({'a': frames[:3] + frames[4:7]}, PHANTOM, rounds(1))
+    fitting = frames[:3] + frames[4:7]
+    without = calibrate({'a': fitting}, PHANTOM, rounds(1, model='none'))
     np.testing.assert_allclose(
         job.fluoroscopes['a'].interior, without.fluoroscopes['a'].interior, atol=0.02
     )

@@ -265,7 +265,7 @@ def few_at_a_corner(angles, exposure):
     uv = rng.uniform(0, 12, (len(angles), 2))
     residuals = 1.3 * np.column_stack([np.cos(angles), np.sin(angles)])
     beside = rng.uniform(0, 30, (6, 2))
-    inliers = np.concatenate([beside, rng.uniform(0.2, 1, (2000, 2)) * SIZE])
+    inliers = np.concatenate([beside, rng.uniform(0.2, 1, (1000, 2)) * SIZE])
     return exceeding(
         FittedPoints(uv, residuals, np.array(exposure)), np.arange(len(angles)), inliers
     )

@@ -28,7 +28,7 @@ WORST_PX = 0.1  # largest error [px], which occurs outside the calibrated area
 @functools.cache
 def calibration():
     """Return a calibration of small images with changes by the angle of up to about 5 px."""
-    return rigs.turning(rigs.pincushion('a', SIZE), size_px=0.4)
+    return rigs.turning(rigs.smooth_pincushion('a', SIZE), size_px=0.4)
 
 
 @functools.cache

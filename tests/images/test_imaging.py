@@ -99,7 +99,7 @@ def test_profile_of_small_shadows_that_move_is_an_estimate():
 @pytest.mark.parametrize('others', [[8.0, 8.0, 10.5], [5.5, 8.0, 10.5]])
 def test_sizes_that_are_not_told_are_seen(radius_px, others):
     """The first profile, which is of beads of all sizes, fits few of them."""
-    radii = np.tile([5.5, *others], 3)
+    radii = np.tile([5.5, *others], 2)
     imaging, *_ = completed(radii, None, radius_px)
     size = imaging.size / np.median(imaging.size[radii == 8])
     np.testing.assert_allclose(size, radii / 8, rtol=0.05)

@@ -51,7 +51,7 @@ from fluoro_calib_ros.simulation.marker_images import (
 )
 from fluoro_calib_ros.simulation.rig import VirtualRig
 
-FRAMES = 30
+FRAMES = 26
 SEED = 26  # markers cross in both views, but are apart in the first images
 OPTIONS = MarkerOptions(shutter=SCENE.shutter)
 FAR_PX = 1.0  # a centre further from the truth is that of another object
@@ -867,16 +867,16 @@ def test_a_body_is_found_again_where_it_comes_back():
     views = MarkerViews(calibrations, orientation, options, first=first, bodies=known_bodies())
     found = 0
     for number, of in enumerate(images, 1):
-        hidden = 8 <= number < 18
+        hidden = 6 <= number < 14
         shown = without_second_body(of) if hidden else {n: each.image for n, each in of.items()}
         result = views.update(shown, number)
         for name, view in result.views.items():
             row = np.searchsorted(ids, view.target_id)
             away = np.linalg.norm(view.uv - of[name].uv[row], axis=1)
             assert not ((away > FAR_PX) & ~view.doubtful).any()
-            if number > 22:
+            if number > 18:
                 found += int(((away < FAR_PX) & (row >= 4)).sum())
-    seen = sum(int(o.seen[4:].sum()) for of in images[22:] for o in of.values())
+    seen = sum(int(o.seen[4:].sum()) for of in images[18:] for o in of.values())
     assert found > 0.9 * seen
 
 

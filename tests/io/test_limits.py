@@ -3,6 +3,8 @@
 
 """Limits of reading: what exceeds them is refused in one sentence before anything is decoded."""
 
+from operator import methodcaller
+
 import cv2
 import numpy as np
 import pytest
@@ -130,11 +132,8 @@ def test_command_line_sets_limits(tmp_path, capsys):
     assert read_limits() == ReadLimits()
 
 
-def limits_of_worker(_):
-    return read_limits()
-
-
 def test_workers_have_the_limits_of_their_parent(limited):
     limited(max_file_mb=7)
     with LocalWorkers(2) as workers:
-        assert next(workers.map(limits_of_worker, [0])) == ReadLimits(max_file_mb=7)
+        limits = workers.map(methodcaller('__call__'), [read_limits])
+        assert next(limits) == ReadLimits(max_file_mb=7)

@@ -72,6 +72,11 @@ def chunks_of(path):
     return out
 
 
+def places(rng, length, count):
+    """Return one place in each of `count` equal parts of a file, drawn at random."""
+    return [rng.randrange(i * length // count, (i + 1) * length // count) for i in range(count)]
+
+
 def held(path):
     return Counter((m.topic, m.log_time_ns, m.data) for m in iterate_messages(path))
 
@@ -117,8 +122,7 @@ def test_bag_cut_off_anywhere_gives_the_complete_chunks(tmp_path, bag):
     rng = random.Random(1)
     cut = tmp_path / 'cut.mcap'
     total = sum(len(inside) for *_, inside in chunks)
-    for number in range(50):
-        length = rng.randrange(len(content))
+    for number, length in enumerate(places(rng, len(content), 20)):
         cut.write_bytes(content[:length])
         whole = [m for _, end, inside in chunks if end <= length for m in inside]
         if not whole:
@@ -140,9 +144,8 @@ def test_flipped_bit_costs_one_chunk_at_most(tmp_path, bag):
     rng = random.Random(2)
     flipped = tmp_path / 'flipped.mcap'
     # Some bits are in the heads of chunks, which are few bytes with a large effect.
-    places = [rng.randrange(len(content)) for _ in range(30)]
-    places += [rng.choice(chunks)[0] + rng.randrange(50) for _ in range(20)]
-    for number, place in enumerate(places):
+    heads = [start + rng.randrange(50) for start, *_ in chunks]
+    for number, place in enumerate([*places(rng, len(content), 15), *heads]):
         damaged = bytearray(content)
         damaged[place] ^= 1 << rng.randrange(8)
         flipped.write_bytes(damaged)

@@ -21,17 +21,24 @@ from fluoro_calib_ros.report import html as html_report
 OPTIONS = {'max_iterations': 2}
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Result folder of fluoroscope a; figures of the report are not drawn."""
-    monkeypatch.setattr(html_report, '_figures', lambda *_: [])
-    save_result(tmp_path / 'result', calibrated('a', 6, **OPTIONS))
+@pytest.fixture(scope='module')
+def written(tmp_path_factory):
+    """Result folder of fluoroscope a."""
+    path = tmp_path_factory.mktemp('written') / 'result'
+    save_result(path, calibrated('a', 6, **OPTIONS))
     request = CalibrationRequest(
         {'a': exposures()['a'][:6]}, rig().phantom, CalibrationOptions(**OPTIONS)
     )
-    write_request(tmp_path / 'result', request)
+    write_request(path, request)
+    return path
+
+
+@pytest.fixture
+def folder(written, tmp_path, monkeypatch):
+    """A copy of the result folder; figures of the report are not drawn."""
+    monkeypatch.setattr(html_report, '_figures', lambda *_: [])
     (tmp_path / 'points.csv').write_text('fluoroscope,u,v\na,100,200\n')
-    return tmp_path / 'result'
+    return shutil.copytree(written, tmp_path / 'result')
 
 
 def exchange(folder):

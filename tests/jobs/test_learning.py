@@ -53,6 +53,11 @@ def healthy():
     return Healthy()
 
 
+@pytest.fixture(scope='module')
+def learned(healthy):
+    return healthy.learn()
+
+
 def moving(frames, marker, px=6.0):
     """Return frames in which one marker moves relative to the others, in both views."""
     rng = np.random.default_rng(3)
@@ -66,8 +71,7 @@ def moving(frames, marker, px=6.0):
     }
 
 
-def test_learned_shapes_are_those_of_the_bodies(healthy):
-    learned = healthy.learn()
+def test_learned_shapes_are_those_of_the_bodies(healthy, learned):
     assert learned.findings == () and learned.exposures == 2 * RATE_HZ
     assert learned.orientation_ids == (healthy.orientation.orientation_id,)
     ids = {name: one.calibration_id for name, one in healthy.calibrations.items()}
@@ -170,8 +174,8 @@ def test_file_holds_the_same_values(healthy, tmp_path):
         ({'digest': None, 'bodies': []}, 'there are no bodies'),
     ],
 )
-def test_file_that_is_not_right_is_refused(healthy, tmp_path, change, message):
-    write_learned_shapes(tmp_path, healthy.learn())
+def test_file_that_is_not_right_is_refused(learned, tmp_path, change, message):
+    write_learned_shapes(tmp_path, learned)
     path = tmp_path / LEARNED_SHAPES
     document = {**json.loads(path.read_text()), **change}
     path.write_text(json.dumps({k: v for k, v in document.items() if v is not None}))

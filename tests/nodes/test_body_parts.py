@@ -404,7 +404,7 @@ def test_a_body_with_mirrored_coordinates_is_told_in_the_diagnostics():
     mirrored = replace(BODIES[0], xyz_mm=BODIES[0].xyz_mm * [-1, 1, 1])
     for body, level in ((BODIES[0], OK), (mirrored, WARN)):
         follower = BodyFollower((body, BODIES[1]), [], 0)
-        contents = follow(follower, range(100), rng=np.random.default_rng(1))
+        contents = follow(follower, range(80), rng=np.random.default_rng(1))
         assert contents[-1].poses[0].status[0] == PoseStatus.OK
         femur, tibia = statuses_of(follower, RecentCounts())
         assert (femur.level, tibia.level) == (level, OK)

@@ -5,13 +5,13 @@
 
 import importlib
 import re
-import subprocess
-import sys
 from importlib.machinery import ModuleSpec
 from types import ModuleType, SimpleNamespace
 
 import pytest
 
+from fluoro_calib_ros.nodes import correction_node
+from fluoro_calib_ros.nodes.runtime import main
 from fluoro_calib_ros.nodes.runtime.main import (
     _description,
     asks_for_help,
@@ -48,11 +48,12 @@ def test_help_is_asked_for_in_front_of_the_arguments_of_ros():
     assert not asks_for_help(['--ros-args', '-p', 'x:=--help', '--help'])
 
 
-def test_help_is_printed_without_starting_a_node():
-    command = [sys.executable, '-m', 'fluoro_calib_ros.nodes.correction_node', '--help']
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout.startswith('usage: correction_node ')
-    assert done.stderr == ''
+def test_help_is_printed_without_starting_a_node(monkeypatch, capfd):
+    monkeypatch.setattr(main, '_init', pytest.fail)
+    with pytest.raises(SystemExit, match='0'):
+        correction_node.main(['--help'])
+    printed = capfd.readouterr()
+    assert printed.out.startswith('usage: correction_node ') and printed.err == ''
 
 
 def test_unknown_parameters_are_told_with_what_was_meant():

@@ -89,7 +89,8 @@ def tilted(count=6):
 def test_no_false_alarm_on_the_virtual_rig(count, seed):
     rig = virtual_rig(seed)
     for name, frames in simulate_exposures(rig, count, seed).frames.items():
-        measured = measured_network({name: frames}, rig.phantom)
+        fewer = [replace(f, target_id=f.target_id[::2], uv=f.uv[::2]) for f in frames]
+        measured = measured_network({name: fewer}, rig.phantom)
         self_calibrate(measured, CalibrationOptions(model='none'))
 
 

@@ -232,7 +232,7 @@ def test_covariance_against_monte_carlo():
     tests = []
     distances = []
     known = Intersector(orientation, reject=None)
-    for _ in range(600):
+    for _ in range(300):
         noisy = uv + rng.normal(0, SIGMA, uv.shape)
         wrong = moved(orientation, root @ rng.normal(size=len(root)))
         found = Intersector(wrong, reject=None).intersect(noisy, sigma)

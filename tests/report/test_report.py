@@ -109,7 +109,7 @@ def test_figures_of_joint_run_with_interior_held(scene, tmp_path, without_pixels
     assert os.listdir(tmp_path / 'other') == []
 
 
-def test_figures_without_model_or_runs(scene, plain, tmp_path):
+def test_figures_without_model_or_runs(scene, plain, tmp_path, without_pixels):
     """Without a model there is no cost or distortion; without runs there are no figures."""
     phantom, frames = scene
     names = {os.path.basename(path) for path in write_figures(plain, tmp_path)}

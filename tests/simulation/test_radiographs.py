@@ -205,7 +205,9 @@ def test_beads_absorb_in_their_shadow_alone(focal_spot_mm):
     scene = MarkerScene(clusters=1, hidden=0.0, bones=False)
     markers = MovingMarkers(scene, 1)
     settings = replace(MARKER_SETTINGS, focal_spot_mm=focal_spot_mm, round_field=False)
-    taken = MarkerRadiography(virtual_rig(1).fluoroscopes[0], markers, settings)
+    whole = virtual_rig(1).fluoroscopes[0]
+    middle = replace(whole, image_size=(768, 768), interior=whole.interior - [128, 128, 0])
+    taken = MarkerRadiography(middle, markers, settings)
     light, uv, _ = taken._light(1, np.arange(scene.markers))
     far = np.ones(light.shape, bool)
     for u, v in np.rint(uv[:, taken.in_field(uv[0], 30.0)]).astype(int).reshape(-1, 2):

@@ -15,7 +15,7 @@ from scipy.special import chndtr
 from ..errors import DataError
 from ..findings import Finding, Kind
 from ..photogrammetry.threads import one_thread
-from .contrasts import black_level, usual_depth
+from .contrasts import black_level, black_of_holes, usual_depth
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
 from .growth import SURVEY_SIGMAS, Match, Seen, is_likelier, nearby_residuals, supported
@@ -268,7 +268,8 @@ def _first_measured(
     detections: Detections, seen: Seen, predicted: _Predicted, model: PhantomModel
 ) -> _Measured:
     """Measure all predicted beads in light above a grey value that their contrasts determine."""
-    black = 0.0
+    is_sheet = detections.inverted and model.grid is not None
+    black = black_of_holes(detections.light) if is_sheet else 0.0
     start: Profile | None = None
     for _ in range(BLACK_ROUNDS):
         imaging = _first_imaging(
@@ -284,7 +285,7 @@ def _first_measured(
             steps=FIRST_STEPS,
         )
         before = black
-        if not (detections.inverted and model.grid is not None):  # holes in a sheet
+        if not is_sheet:
             black = black_level(measured.beads, black)
         if black == before:
             break

@@ -211,8 +211,9 @@ def _with_sizes(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
 def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     """Return a copy with the unsharp mask that the image has.
 
-    It gives shadows bright borders, so that shadows that are close move apart. It is only looked
-    for if some are close, and if the residuals of isolated shadows have a part in common.
+    It gives shadows bright borders, so that shadows that are close move apart, and without it,
+    residuals are no noise. It is only looked for if those of isolated shadows have a part in
+    common.
     """
     size = imaging.size[shadows.row]
     start = replace(
@@ -221,10 +222,9 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         mask_px=START_MASK_PX,
     )
     distance = _distance(shadows)
-    close = distance < 2 * imaging.profile.reach_px
     alone = shadows.seen & np.isfinite(size) & (distance > 2 * start.reach_px)
     rows = _sampled(np.flatnonzero(alone), SAMPLE)
-    if len(rows) < FEW or not close.any():
+    if len(rows) < FEW:
         return imaging
     shapes = shadows.shape[rows], size[rows]
     fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)

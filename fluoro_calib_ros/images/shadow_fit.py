@@ -415,7 +415,7 @@ def _shifts(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """
     # The noise of holes in a sheet does not increase with the inverted light: they are not shadows
     # that attenuate it.
-    blurred, masked = fit.profile.drawn_px2 if fit.noise.gain else (0.0, 0.0)
+    blurred, masked = fit.profile.drawn_px2 if fit.noise.gain > 0 else (0.0, 0.0)
     slope = fit.background.slope(fit.uv - fit.middle)
     drawn = blurred * slope
     shift = DRAWN * drawn

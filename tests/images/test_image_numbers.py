@@ -109,6 +109,7 @@ def test_score_of_a_match_counts_what_is_missing():
     empty = np.zeros(0)
     known = {
         'found': 0.9,
+        'apart': 0.9,
         'explained': 1,
         'scale_px': 1,
         'expected': 40,

@@ -380,6 +380,9 @@ def test_windows_of_beads_that_look_larger_are_larger():
 RADIUS = 8.0
 
 
+SHADOWS = ('row', 'uv', 'shape', 'seen', 'alone')
+
+
 def radiograph_of_pairs(scatter: float, photons: float = 300) -> tuple[np.ndarray, Expected]:
     """Return a radiograph (h, w) with scatter, and shadows: 20 spheres alone and 16 in pairs."""
     rng = np.random.default_rng(3)
@@ -450,6 +453,11 @@ def test_an_unsharp_mask_is_estimated_if_there_is_one(factor, scatter, clipped):
     without = measure_beads(light, shadows.uv, shadows.shape, plain, noise)
     errors = [np.sqrt(np.mean((one.uv - shadows.uv)[20:] ** 2)) for one in (beads, without)]
     assert errors[0] < 0.5 * errors[1]
+    # Without shadows that touch, the mask is still a part of the model.
+    rows = np.flatnonzero(shadows.alone)
+    alone = Expected(*(getattr(shadows, name)[rows] for name in SHADOWS))
+    imaging = first_imaging(light, noise, alone, RADIUS, size=np.ones(36))
+    assert imaging.profile.sharpening == pytest.approx(factor, rel=0.15)
 
 
 def test_an_unsharp_mask_may_leave_less_than_no_direct_light():

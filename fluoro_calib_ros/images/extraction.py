@@ -486,9 +486,9 @@ def _chances_of_wrong(
     residual: (n,) distances from the predictions; sigma, scatter: (n,) standard deviations of
     coordinates of centres and of predictions. Given the residual, the error of a centre is normal.
     Its mean is the share of the residual that is not due to the prediction. A centre is wrong if
-    it is off by half a pixel, and by more than one in a thousand of such centres.
+    it is off by half a pixel, and by more than one in a thousand of the usual centres.
     """
-    wrong_px = WRONG_SIGMAS * np.maximum(sigma, SURE_SIGMA_PX)
+    wrong_px = WRONG_SIGMAS * max(float(np.median(sigma)), SURE_SIGMA_PX)
     total = sigma**2 + scatter**2
     mean = residual * sigma**2 / total
     variance = sigma**2 * scatter**2 / total

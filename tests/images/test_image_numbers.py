@@ -249,6 +249,15 @@ def test_chance_of_a_wrong_centre_is_that_of_half_a_pixel_where_it_is_known_bett
     assert told == pytest.approx(np.exp(-(0.5**2) / (2 * 0.12**2)), rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ('usual', 'scatter', 'is_likely'), [(0.05, 0.3, True), (0.05, 0.1, False), (0.2, 0.3, False)]
+)
+def test_a_vague_centre_among_sharp_ones_needs_neighbours_that_agree(usual, scatter, is_likely):
+    sigma = np.array([0.2, *np.full(6, usual)])
+    chance = extraction._chances_of_wrong(np.full(7, 0.2), sigma, np.full(7, scatter))
+    assert bool(chance[0] > extraction.WRONG_SHARE) is is_likely
+
+
 @pytest.mark.parametrize(('scatter', 'is_kept'), [(0.05, False), (0.3, True)])
 def test_bead_that_is_likely_half_a_pixel_off_is_not_observed(scatter, is_kept):
     n = 20

@@ -81,11 +81,14 @@ def estimate_profile(
     place = uv[alone]
     shapes = shape[alone], None if size is None else size[alone]
     start = start or Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)
+    # Windows that end with a mask hardly tell its width: the narrower it is taken, the smaller are
+    # they, and fits in them are not comparable.
+    least_reach_px = start.reach_px if start.sharpening else 0.0
     profiles = [start]
     lacks: list[float] = []
     while len(lacks) < PROFILE_ROUNDS and len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
         before = profiles[-1]
-        fit = _profile_fit(light, place, shapes, before)
+        fit = _profile_fit(light, place, shapes, before, least_reach_px)
         place = fit.uv
         lacks.append(fit.typical())
         profile = fit_profile(fit.absorbed(), before, estimated)
@@ -243,7 +246,13 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         _profile_fit(light, shadows.uv[rows], shapes, one, profile.reach_px).typical()
         for one in (imaging.profile, profile)
     )
-    return replace(imaging, profile=profile) if masked < BETTER * plain else imaging
+    if masked >= BETTER * plain:
+        return imaging
+    fit = BeadFit(
+        light, shadows.uv[rows], shapes[0], profile=profile, noise=imaging.noise, size=shapes[1]
+    )
+    fit.run(STEPS)
+    return replace(imaging, profile=profile, noise=fit.noise_of_windows())
 
 
 def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:

@@ -12,7 +12,7 @@ overlap. All windows of an image take their Gauss-Newton steps at once.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .background import START_SPREAD, TERMS, Background, HiddenLight
 from .clipping import UNCLIPPED
-from .light import MIN_PIXELS, Noise, correlation_of, less_common
+from .light import MIN_PIXELS, Noise, correlation_of, less_common, line_of_variance
 from .profile import Profile
 from .texture import DTYPE, Texture, window_offsets
 
@@ -50,6 +50,7 @@ UNDISTURBED = 4.0  # largest lack of fit, over the median, of a window without o
 # Information of a pixel, over that of one that is not clipped, from which its residual counts in
 # statistics of residuals.
 KNOWN = 0.5
+MIN_KEPT = 0.1  # least share of the noise of a pixel that counts as left in its residual
 ROBUST = 2.5  # residual at which the weight is halved [standard deviations of the noise]
 
 # Rows of beads (g,) and of their neighbours (g, k), -1 for none.
@@ -371,6 +372,35 @@ class ShadowFit(ABC):
             influence = np.linalg.solve(equations.plain[some], equations.weighted[some])
             self.influence = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
         return inverse
+
+    def noise_of_windows(self) -> Noise:
+        """Return the noise of pixels in usual windows, or that of the image if these are few."""
+        level, deviation = self._deviations()
+        if len(level) < MIN_PIXELS:
+            return self.noise
+        constant, gain = line_of_variance(level, deviation)
+        return replace(self.noise, constant=constant, gain=gain)
+
+    def _deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return expected light (k,) and absolute residuals (k,) of pixels in usual windows.
+
+        The unknowns of a window absorb a part of the noise, the leverage of each pixel; residuals
+        are those without this loss.
+        """
+        out = [np.zeros((2, 0))]
+        for rows, near in self.groups:
+            equations = self._equations((rows, near), True, None)
+            light, jacobian = self._model(rows, near)
+            residual, _, information = self._observed(rows, light)
+            influence = np.linalg.solve(equations.matrix, equations.weighted)
+            kept = np.clip(1 - (jacobian * influence).sum(axis=1), MIN_KEPT, 1)
+            known = (information > KNOWN) & self.clipping.leaves(light)
+            known &= (self.usable[rows] & (self.misfit[rows] <= DISTURBED * self.typical()))[
+                :, None
+            ]
+            out.append(np.stack([light, np.abs(residual) / np.sqrt(kept)])[:, known])
+        light, residual = np.concatenate(out, axis=1)
+        return light, residual
 
     def _beads(
         self, measured: NDArray[np.bool_], typical: float, noise: NDArray[np.float64] | None = None

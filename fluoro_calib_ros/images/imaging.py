@@ -21,7 +21,7 @@ from .detection import LARGER
 from .light import Light, Noise, vertex
 from .measurement import FIRST_STEPS, RADIUS_SD, STEPS, BeadFit, rounded, scatter_equation
 from .profile import LIMITS, MASKED, PLAIN, SHAPE, Profile, fit_profile
-from .shadow_fit import DISTURBED, ShadowFit
+from .shadow_fit import DISTURBED, ShadowFit, noise_of_windows
 
 PROFILE_STEPS = 3
 PROFILE_BEADS = 100  # largest number of beads for the profile
@@ -252,7 +252,7 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         light, shadows.uv[rows], shapes[0], profile=profile, noise=imaging.noise, size=shapes[1]
     )
     fit.run(STEPS)
-    return replace(imaging, profile=profile, noise=fit.noise_of_windows())
+    return replace(imaging, profile=profile, noise=noise_of_windows(fit))
 
 
 def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:

@@ -34,6 +34,7 @@ from .shadow_fit import (
     FitSettings,
     NormalEquations,
     ShadowFit,
+    noise_of_windows,
 )
 from .texture import DTYPE
 
@@ -115,7 +116,7 @@ def noise_of_markers(
     """
     fit = _MarkerFit(windows, MarkerGuess.standing(uv), profile, noise)
     fit.run()
-    return fit.noise_of_windows()
+    return noise_of_windows(fit)
 
 
 @lru_cache(maxsize=8)

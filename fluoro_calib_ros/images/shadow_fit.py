@@ -373,35 +373,6 @@ class ShadowFit(ABC):
             self.influence = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
         return inverse
 
-    def noise_of_windows(self) -> Noise:
-        """Return the noise of pixels in usual windows, or that of the image if these are few."""
-        level, deviation = self._deviations()
-        if len(level) < MIN_PIXELS:
-            return self.noise
-        constant, gain = line_of_variance(level, deviation)
-        return replace(self.noise, constant=constant, gain=gain)
-
-    def _deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return expected light (k,) and absolute residuals (k,) of pixels in usual windows.
-
-        The unknowns of a window absorb a part of the noise, the leverage of each pixel; residuals
-        are those without this loss.
-        """
-        out = [np.zeros((2, 0))]
-        for rows, near in self.groups:
-            equations = self._equations((rows, near), True, None)
-            light, jacobian = self._model(rows, near)
-            residual, _, information = self._observed(rows, light)
-            influence = np.linalg.solve(equations.matrix, equations.weighted)
-            kept = np.clip(1 - (jacobian * influence).sum(axis=1), MIN_KEPT, 1)
-            known = (information > KNOWN) & self.clipping.leaves(light)
-            known &= (self.usable[rows] & (self.misfit[rows] <= DISTURBED * self.typical()))[
-                :, None
-            ]
-            out.append(np.stack([light, np.abs(residual) / np.sqrt(kept)])[:, known])
-        light, residual = np.concatenate(out, axis=1)
-        return light, residual
-
     def _beads(
         self, measured: NDArray[np.bool_], typical: float, noise: NDArray[np.float64] | None = None
     ) -> Beads:
@@ -436,6 +407,35 @@ class ShadowFit(ABC):
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,
         )
+
+
+def noise_of_windows(fit: ShadowFit) -> Noise:
+    """Return the noise of pixels in usual windows, or that of the image if these are few."""
+    level, deviation = _deviations(fit)
+    if len(level) < MIN_PIXELS:
+        return fit.noise
+    constant, gain = line_of_variance(level, deviation)
+    return replace(fit.noise, constant=constant, gain=gain)
+
+
+def _deviations(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return expected light (k,) and absolute residuals (k,) of pixels in usual windows.
+
+    The unknowns of a window absorb a part of the noise, the leverage of each pixel; residuals
+    are those without this loss.
+    """
+    out = [np.zeros((2, 0))]
+    for rows, near in fit.groups:
+        equations = fit._equations((rows, near), True, None)
+        light, jacobian = fit._model(rows, near)
+        residual, _, information = fit._observed(rows, light)
+        influence = np.linalg.solve(equations.matrix, equations.weighted)
+        kept = np.clip(1 - (jacobian * influence).sum(axis=1), MIN_KEPT, 1)
+        known = (information > KNOWN) & fit.clipping.leaves(light)
+        known &= (fit.usable[rows] & (fit.misfit[rows] <= DISTURBED * fit.typical()))[:, None]
+        out.append(np.stack([light, np.abs(residual) / np.sqrt(kept)])[:, known])
+    light, residual = np.concatenate(out, axis=1)
+    return light, residual
 
 
 def _shifts(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -567,7 +567,7 @@ MAKERS = {
     Kind.NO_POSE: no_pose,
     Kind.POSE_UNSURE: lambda: raised(
         matching._check_evidence,
-        Fake(explained=0.01, evidence=99.0, expected=90, found=0.9, bead=np.arange(60)),
+        Fake(explained=0.01, evidence=99.0, expected=90, found=0.9, apart=0.9, bead=np.arange(60)),
     ),
     Kind.BEAD_ALONE: lambda: extraction.ALONE,
     Kind.BEAD_AWAY: lambda: bead(uv=9.0),

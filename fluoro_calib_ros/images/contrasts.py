@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .light import Light
 from .shadow_fit import UNDISTURBED, Beads
 from .view import TAIL
 
@@ -83,6 +84,19 @@ def black_level(beads: Beads, black: float) -> float:
     grey = line.light + black
     level = max(black + change, -MAX_DISTANCE * grey)
     return level if abs(level - black) > MIN_CHANGE * line.light else black
+
+
+def black_of_holes(light: Light) -> float:
+    """Return the grey value of no light for holes of a sheet, in its inverted light.
+
+    If holes are clipped, their light is below the bound by an unknown amount. A profile that
+    absorbs all light at the bound would level out there, where the light still falls. It does not
+    if no light is as far below as it may be.
+    """
+    if not np.isfinite(light.clipping.low):
+        return 0.0
+    usual = np.median(light.grey[light.field & light.clipping.leaves(light.grey)])
+    return -MAX_DISTANCE * float(usual)
 
 
 def usual_depth(beads: Beads) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from scipy.special import chndtr
 from ..errors import DataError
 from ..findings import Finding, Kind
 from ..photogrammetry.threads import one_thread
-from .contrasts import black_level, usual_depth
+from .contrasts import black_level, black_of_holes, usual_depth
 from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
 from .growth import SURVEY_SIGMAS, Match, Seen, is_likelier, nearby_residuals, supported
@@ -268,7 +268,8 @@ def _first_measured(
     detections: Detections, seen: Seen, predicted: _Predicted, model: PhantomModel
 ) -> _Measured:
     """Measure all predicted beads in light above a grey value that their contrasts determine."""
-    black = 0.0
+    is_sheet = detections.inverted and model.grid is not None
+    black = black_of_holes(detections.light) if is_sheet else 0.0
     start: Profile | None = None
     for _ in range(BLACK_ROUNDS):
         imaging = _first_imaging(
@@ -284,7 +285,7 @@ def _first_measured(
             steps=FIRST_STEPS,
         )
         before = black
-        if not (detections.inverted and model.grid is not None):  # holes in a sheet
+        if not is_sheet:
             black = black_level(measured.beads, black)
         if black == before:
             break
@@ -485,9 +486,9 @@ def _chances_of_wrong(
     residual: (n,) distances from the predictions; sigma, scatter: (n,) standard deviations of
     coordinates of centres and of predictions. Given the residual, the error of a centre is normal.
     Its mean is the share of the residual that is not due to the prediction. A centre is wrong if
-    it is off by half a pixel, and by more than one in a thousand of such centres.
+    it is off by half a pixel, and by more than one in a thousand of the usual centres.
     """
-    wrong_px = WRONG_SIGMAS * np.maximum(sigma, SURE_SIGMA_PX)
+    wrong_px = WRONG_SIGMAS * max(float(np.median(sigma)), SURE_SIGMA_PX)
     total = sigma**2 + scatter**2
     mean = residual * sigma**2 / total
     variance = sigma**2 * scatter**2 / total

@@ -118,6 +118,7 @@ class Match:
     #: (m, 2), predicted pixels of all beads of the phantom, with interpolated residuals
     predicted: NDArray[np.float64]
     found: float  #: share of the beads predicted in the field that are found
+    apart: float  #: the same share of those predicted apart from each other
     #: share of the detections within the outline of the predicted beads that are predicted
     explained: float
     scale_px: float  #: robust standard deviation of the residuals
@@ -275,6 +276,7 @@ def _judged(
     near = np.maximum(reach, 1.2 * seen.radius_px)[nearest]
     is_explained = (prediction_distance < near)[within]
     by_chance = _by_chance(reach, within, area)
+    found_apart = is_found[spacing >= 2 * seen.radius_px]
     good = _good_cells(predicted[row], is_found, seen.field.shape)
     # A detection between two predictions may belong to either.
     distance, _ = tree.query(seen.uv[detection], k=2)
@@ -290,11 +292,12 @@ def _judged(
         detection=detection[accepted],
         predicted=predicted,
         found=float(np.mean(is_found)),
+        apart=float(found_apart.sum() / max(len(found_apart), 1)),
         explained=float(is_explained.sum() / max(within.sum(), 1)),
         scale_px=scale,
         expected=len(row),
         against=int(np.sum(~is_found) + np.sum(~is_explained)),
-        evidence=_evidence(is_found[spacing >= 2 * seen.radius_px], by_chance),
+        evidence=_evidence(found_apart, by_chance),
     )
 
 

@@ -21,7 +21,7 @@ from .detection import LARGER
 from .light import Light, Noise, vertex
 from .measurement import FIRST_STEPS, RADIUS_SD, STEPS, BeadFit, rounded, scatter_equation
 from .profile import LIMITS, MASKED, PLAIN, SHAPE, Profile, fit_profile
-from .shadow_fit import DISTURBED, ShadowFit
+from .shadow_fit import DISTURBED, ShadowFit, noise_of_windows
 
 PROFILE_STEPS = 3
 PROFILE_BEADS = 100  # largest number of beads for the profile
@@ -81,11 +81,14 @@ def estimate_profile(
     place = uv[alone]
     shapes = shape[alone], None if size is None else size[alone]
     start = start or Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)
+    # Windows that end with a mask hardly tell its width: the narrower it is taken, the smaller are
+    # they, and fits in them are not comparable.
+    least_reach_px = start.reach_px if start.sharpening else 0.0
     profiles = [start]
     lacks: list[float] = []
     while len(lacks) < PROFILE_ROUNDS and len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
         before = profiles[-1]
-        fit = _profile_fit(light, place, shapes, before)
+        fit = _profile_fit(light, place, shapes, before, least_reach_px)
         place = fit.uv
         lacks.append(fit.typical())
         profile = fit_profile(fit.absorbed(), before, estimated)
@@ -211,8 +214,9 @@ def _with_sizes(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
 def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     """Return a copy with the unsharp mask that the image has.
 
-    It gives shadows bright borders, so that shadows that are close move apart. It is only looked
-    for if some are close, and if the residuals of isolated shadows have a part in common.
+    It gives shadows bright borders, so that shadows that are close move apart, and without it,
+    residuals are no noise. It is only looked for if those of isolated shadows have a part in
+    common.
     """
     size = imaging.size[shadows.row]
     start = replace(
@@ -221,10 +225,9 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         mask_px=START_MASK_PX,
     )
     distance = _distance(shadows)
-    close = distance < 2 * imaging.profile.reach_px
     alone = shadows.seen & np.isfinite(size) & (distance > 2 * start.reach_px)
     rows = _sampled(np.flatnonzero(alone), SAMPLE)
-    if len(rows) < FEW or not close.any():
+    if len(rows) < FEW:
         return imaging
     shapes = shadows.shape[rows], size[rows]
     fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)
@@ -243,7 +246,13 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         _profile_fit(light, shadows.uv[rows], shapes, one, profile.reach_px).typical()
         for one in (imaging.profile, profile)
     )
-    return replace(imaging, profile=profile) if masked < BETTER * plain else imaging
+    if masked >= BETTER * plain:
+        return imaging
+    fit = BeadFit(
+        light, shadows.uv[rows], shapes[0], profile=profile, noise=imaging.noise, size=shapes[1]
+    )
+    fit.run(STEPS)
+    return replace(imaging, profile=profile, noise=noise_of_windows(fit))
 
 
 def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:

@@ -101,7 +101,10 @@ def white_level(image: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of a grey value, constant + gain * grey value, and correlation of the noise."""
+    """Variance of a grey value, constant + gain * grey value, and correlation of the noise.
+
+    The gain is negative where darker grey values have more noise.
+    """
 
     constant: float
     gain: float
@@ -110,7 +113,8 @@ class Noise:
 
     def variance(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return the variance of grey values, given their expected light."""
-        return np.maximum(self.constant + self.gain * np.maximum(light, 0), MIN_VARIANCE)
+        counted = np.maximum(light, 0) if self.gain > 0 else light
+        return np.maximum(self.constant + self.gain * counted, MIN_VARIANCE)
 
     def above(self, black: float) -> Noise:
         """Return the noise of the light over a grey value that stands for no light."""
@@ -143,19 +147,20 @@ def line_of_variance(
 ) -> tuple[float, float]:
     """Return the constant, and the gain, of the variance of deviations (n,) at levels (n,).
 
-    The variance is estimated robustly at pixels of about the same level.
+    The variance is estimated robustly at pixels of about the same level. It rises with the light,
+    and falls with it in inverted and logarithmic images; it is negative nowhere up to most light.
     """
     parts = np.array_split(np.argsort(level), LEVELS)
     mean = np.array([np.median(level[part]) for part in parts])
     variance = np.array([(1.4826 * np.median(deviation[part])) ** 2 for part in parts])
     variance = np.maximum(variance, MIN_VARIANCE)
     weight = 1 / variance
-    gain = constant = 0.0
+    most = max(float(level.max()), 1.0)
+    rows = np.column_stack([1 - mean / most, mean / most])
     for _ in range(3):
-        rows = np.column_stack([np.ones_like(mean), mean]) * weight[:, None]
-        (constant, gain), _ = nnls(rows, variance * weight)
-        weight = 1 / np.maximum(constant + gain * mean, MIN_VARIANCE)
-    return max(constant, MIN_VARIANCE), gain
+        ends, _ = nnls(rows * weight[:, None], variance * weight)
+        weight = 1 / np.maximum(rows @ ends, MIN_VARIANCE)
+    return max(float(ends[0]), MIN_VARIANCE), float(ends[1] - ends[0]) / most
 
 
 def _seen_by(kernel: NDArray[np.float64], correlation: NDArray[np.float64]) -> float:

@@ -10,7 +10,7 @@ middle of the exposure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 
 from .background import TERMS
 from .fine_grid import Absorbers, FineGrid
-from .light import MIN_PIXELS, Noise, line_of_variance
+from .light import Noise
 from .marker_echo import Echo
 from .marker_intensity import LightWindows, Shadows
 from .marker_motion import SHADOW_SD_PX, MarkerStates, MeasuredMarkers, Motion, assign
@@ -27,7 +27,6 @@ from .profile import Profile
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
-    KNOWN,
     MARGIN_PX,
     MAX_SIGMA_PX,
     MIN_PASSED,
@@ -35,6 +34,7 @@ from .shadow_fit import (
     FitSettings,
     NormalEquations,
     ShadowFit,
+    noise_of_windows,
 )
 from .texture import DTYPE
 
@@ -48,7 +48,6 @@ SETTINGS = FitSettings(
 )
 STEPS_ALONE = 2  # steps of isolated markers, if clipped pixels do not hide the light
 CONVERGED_PX = 0.1  # length of the last step from which another step follows
-MIN_KEPT = 0.1  # least share of the noise of a pixel that counts as left in its residual
 WAY_PX = 2.0  # length of the largest motion for each further quadrature point
 
 
@@ -117,11 +116,7 @@ def noise_of_markers(
     """
     fit = _MarkerFit(windows, MarkerGuess.standing(uv), profile, noise)
     fit.run()
-    level, deviation = fit.deviations()
-    if len(level) < MIN_PIXELS:
-        return noise
-    constant, gain = line_of_variance(level, deviation)
-    return replace(noise, constant=constant, gain=gain)
+    return noise_of_windows(fit)
 
 
 @lru_cache(maxsize=8)
@@ -313,27 +308,6 @@ class _MarkerFit(ShadowFit):
         shadow, _, _ = self._shadow(marker, self.middle[rows])
         separate = np.prod(1 - depth[..., None] * shadow, axis=1)
         return FineGrid(self.offset, self.profile).light_behind(beads) - separate
-
-    def deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return expected light (k,) and absolute residuals (k,) of pixels in usual windows.
-
-        The unknowns of a window absorb a part of the noise, the leverage of each pixel; residuals
-        are those without this loss.
-        """
-        out = [np.zeros((2, 0))]
-        for rows, near in self.groups:
-            equations = self._equations((rows, near), True, None)
-            light, jacobian = self._model(rows, near)
-            residual, _, information = self._observed(rows, light)
-            influence = np.linalg.solve(equations.matrix, equations.weighted)
-            kept = np.clip(1 - (jacobian * influence).sum(axis=1), MIN_KEPT, 1)
-            known = (information > KNOWN) & self.clipping.leaves(light)
-            known &= (self.usable[rows] & (self.misfit[rows] <= DISTURBED * self.typical()))[
-                :, None
-            ]
-            out.append(np.stack([light, np.abs(residual) / np.sqrt(kept)])[:, known])
-        light, residual = np.concatenate(out, axis=1)
-        return light, residual
 
     def echoes(
         self, before: NDArray[np.float64], measured: NDArray[np.bool_]

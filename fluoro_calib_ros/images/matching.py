@@ -49,7 +49,8 @@ from .view import Lens, fit_view
 
 MIN_BEADS = 10
 # Shares found and explained from which a pose is accepted. If many beads overlap, fewer are
-# found, but nothing else is detected.
+# found, but nothing else is detected: the second pair counts beads that are predicted apart from
+# each other.
 EVIDENT = ((MIN_FOUND, MIN_EXPLAINED), (0.6, 0.85))
 # Shares found and explained from which the search ends.
 SURE = ((0.85, MIN_EXPLAINED), (0.75, 0.95))
@@ -259,8 +260,9 @@ def is_evident(best: Match) -> bool:
 
 
 def _is_supported(best: Match, shares: Sequence[tuple[float, float]]) -> bool:
-    """Return whether a match has the shares found and explained of one of some pairs."""
-    return any(best.found >= found and best.explained >= explained for found, explained in shares)
+    """Return whether a match has the shares found and explained of one of two pairs."""
+    pairs = zip((best.found, best.apart), shares)
+    return any(own >= found and best.explained >= explained for own, (found, explained) in pairs)
 
 
 def _check_evidence(best: Match) -> None:

@@ -12,7 +12,7 @@ overlap. All windows of an image take their Gauss-Newton steps at once.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .background import START_SPREAD, TERMS, Background, HiddenLight
 from .clipping import UNCLIPPED
-from .light import MIN_PIXELS, Noise, correlation_of, less_common
+from .light import MIN_PIXELS, Noise, correlation_of, less_common, line_of_variance
 from .profile import Profile
 from .texture import DTYPE, Texture, window_offsets
 
@@ -50,6 +50,7 @@ UNDISTURBED = 4.0  # largest lack of fit, over the median, of a window without o
 # Information of a pixel, over that of one that is not clipped, from which its residual counts in
 # statistics of residuals.
 KNOWN = 0.5
+MIN_KEPT = 0.1  # least share of the noise of a pixel that counts as left in its residual
 ROBUST = 2.5  # residual at which the weight is halved [standard deviations of the noise]
 
 # Rows of beads (g,) and of their neighbours (g, k), -1 for none.
@@ -408,6 +409,35 @@ class ShadowFit(ABC):
         )
 
 
+def noise_of_windows(fit: ShadowFit) -> Noise:
+    """Return the noise of pixels in usual windows, or that of the image if these are few."""
+    level, deviation = _deviations(fit)
+    if len(level) < MIN_PIXELS:
+        return fit.noise
+    constant, gain = line_of_variance(level, deviation)
+    return replace(fit.noise, constant=constant, gain=gain)
+
+
+def _deviations(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return expected light (k,) and absolute residuals (k,) of pixels in usual windows.
+
+    The unknowns of a window absorb a part of the noise, the leverage of each pixel; residuals
+    are those without this loss.
+    """
+    out = [np.zeros((2, 0))]
+    for rows, near in fit.groups:
+        equations = fit._equations((rows, near), True, None)
+        light, jacobian = fit._model(rows, near)
+        residual, _, information = fit._observed(rows, light)
+        influence = np.linalg.solve(equations.matrix, equations.weighted)
+        kept = np.clip(1 - (jacobian * influence).sum(axis=1), MIN_KEPT, 1)
+        known = (information > KNOWN) & fit.clipping.leaves(light)
+        known &= (fit.usable[rows] & (fit.misfit[rows] <= DISTURBED * fit.typical()))[:, None]
+        out.append(np.stack([light, np.abs(residual) / np.sqrt(kept)])[:, known])
+    light, residual = np.concatenate(out, axis=1)
+    return light, residual
+
+
 def _shifts(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return shifts (n, 2) back from less light, where blur and mask have drawn shadows [px].
 
@@ -415,7 +445,7 @@ def _shifts(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """
     # The noise of holes in a sheet does not increase with the inverted light: they are not shadows
     # that attenuate it.
-    blurred, masked = fit.profile.drawn_px2 if fit.noise.gain else (0.0, 0.0)
+    blurred, masked = fit.profile.drawn_px2 if fit.noise.gain > 0 else (0.0, 0.0)
     slope = fit.background.slope(fit.uv - fit.middle)
     drawn = blurred * slope
     shift = DRAWN * drawn

@@ -803,6 +803,7 @@ def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
     evidence = matching.MIN_EVIDENCE
     best = Fake(
         found=found,
+        apart=found,
         explained=explained,
         bead=np.arange(beads),
         expected=30,

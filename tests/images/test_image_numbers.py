@@ -109,6 +109,7 @@ def test_score_of_a_match_counts_what_is_missing():
     empty = np.zeros(0)
     known = {
         'found': 0.9,
+        'apart': 0.9,
         'explained': 1,
         'scale_px': 1,
         'expected': 40,
@@ -246,6 +247,15 @@ def test_chance_of_a_wrong_centre_is_that_of_errors_with_such_a_residual():
 def test_chance_of_a_wrong_centre_is_that_of_half_a_pixel_where_it_is_known_better():
     (told,) = extraction._chances_of_wrong(np.zeros(1), np.full(1, 0.12), np.full(1, 9.0))
     assert told == pytest.approx(np.exp(-(0.5**2) / (2 * 0.12**2)), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ('usual', 'scatter', 'is_likely'), [(0.05, 0.3, True), (0.05, 0.1, False), (0.2, 0.3, False)]
+)
+def test_a_vague_centre_among_sharp_ones_needs_neighbours_that_agree(usual, scatter, is_likely):
+    sigma = np.array([0.2, *np.full(6, usual)])
+    chance = extraction._chances_of_wrong(np.full(7, 0.2), sigma, np.full(7, scatter))
+    assert bool(chance[0] > extraction.WRONG_SHARE) is is_likely
 
 
 @pytest.mark.parametrize(('scatter', 'is_kept'), [(0.05, False), (0.3, True)])

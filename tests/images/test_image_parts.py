@@ -229,6 +229,16 @@ def test_noise_of_an_image_is_that_of_its_pixels(blur):
     assert (few.constant, few.gain) == (1 / 12, 0.0)
 
 
+def test_noise_may_fall_with_the_light():
+    """In an inverted image, that of photons does; below a bound it keeps rising."""
+    rng = np.random.default_rng(5)
+    light = np.tile(np.linspace(5, 120, 400), (300, 1))
+    image = (light + np.sqrt(0.14 * (255 - light)) * rng.normal(size=light.shape)).astype('f4')
+    found = estimate_noise(image, np.ones(image.shape, bool))
+    for level in (-50.0, 10.0, 110.0):
+        assert found.variance(level) == pytest.approx(0.14 * (255 - level), rel=0.12)
+
+
 def test_variance_is_that_of_rounding_at_least():
     noise = Noise(-5.0, 0.5, np.ones((1, 1)))
     np.testing.assert_allclose(
@@ -577,6 +587,7 @@ def found_match(number, scale_px, beads_of=40, turn=0, against=0):
         np.arange(number),
         np.zeros(number),
         found=0.9,
+        apart=0.9,
         explained=0.9,
         scale_px=scale_px,
         expected=beads_of,
@@ -628,7 +639,7 @@ def test_of_two_poses_the_one_with_half_the_residuals_is_taken(monkeypatch):
 @pytest.mark.parametrize('limits, decide', [(EVIDENT, is_evident), (SURE, is_sure)])
 def test_evidence_of_a_pose_is_what_is_found_and_explained(limits, decide):
     def pose(found, explained, evidence=28.0):
-        return Fake(found=found, explained=explained, evidence=evidence)
+        return Fake(found=found, apart=found, explained=explained, evidence=evidence)
 
     for found, explained in limits:
         assert decide(pose(found, explained))
@@ -637,6 +648,14 @@ def test_evidence_of_a_pose_is_what_is_found_and_explained(limits, decide):
     assert not decide(pose(much - 0.01, most - 0.01))
     assert not decide(pose(few - 0.01, 1.0))
     assert not decide(pose(1.0, little - 0.01))
+
+
+@pytest.mark.parametrize('decide', [is_evident, is_sure])
+def test_beads_that_overlap_do_not_count_against_a_pose_that_explains_the_image(decide):
+    pose = Fake(found=0.59, apart=0.87, explained=0.99, evidence=1000.0)
+    assert decide(pose)
+    pose.explained = 0.8
+    assert not decide(pose)
 
 
 def test_poses_that_detections_anywhere_explain_have_no_evidence():

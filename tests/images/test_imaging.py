@@ -380,6 +380,9 @@ def test_windows_of_beads_that_look_larger_are_larger():
 RADIUS = 8.0
 
 
+SHADOWS = ('row', 'uv', 'shape', 'seen', 'alone')
+
+
 def radiograph_of_pairs(scatter: float, photons: float = 300) -> tuple[np.ndarray, Expected]:
     """Return a radiograph (h, w) with scatter, and shadows: 20 spheres alone and 16 in pairs."""
     rng = np.random.default_rng(3)
@@ -431,7 +434,8 @@ def test_scattered_light_stays_where_shadows_are_not_those_of_spheres():
 )
 def test_an_unsharp_mask_is_estimated_if_there_is_one(factor, scatter, clipped):
     """Isolated shadows tell it; those that touch move apart without it. Few pixels are clipped."""
-    image, shadows = radiograph_of_pairs(scatter, 10_000)
+    unmasked, shadows = radiograph_of_pairs(scatter, 10_000)
+    image = unmasked
     image = image + factor * (image - cv2.GaussianBlur(image, (0, 0), 2.5))
     high = np.sort(image, axis=None)[-1 - clipped] if clipped else np.inf
     image = np.minimum(image, high)
@@ -450,6 +454,15 @@ def test_an_unsharp_mask_is_estimated_if_there_is_one(factor, scatter, clipped):
     without = measure_beads(light, shadows.uv, shadows.shape, plain, noise)
     errors = [np.sqrt(np.mean((one.uv - shadows.uv)[20:] ** 2)) for one in (beads, without)]
     assert errors[0] < 0.5 * errors[1]
+    # A mask makes shadows darker, but not their noise.
+    column, row = np.rint(shadows.uv[:20]).astype(int).T
+    amplified = (1 + factor) ** 2 * unmasked[row, column].mean()
+    assert imaging.noise.variance(image[row, column]).mean() == pytest.approx(amplified, rel=0.4)
+    # Without shadows that touch, the mask is still a part of the model.
+    rows = np.flatnonzero(shadows.alone)
+    alone = Expected(*(getattr(shadows, name)[rows] for name in SHADOWS))
+    imaging = first_imaging(light, noise, alone, RADIUS, size=np.ones(36))
+    assert imaging.profile.sharpening == pytest.approx(factor, rel=0.15)
 
 
 def test_an_unsharp_mask_may_leave_less_than_no_direct_light():

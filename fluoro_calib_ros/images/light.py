@@ -143,12 +143,13 @@ def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
 
 
 def line_of_variance(
-    level: NDArray[np.floating], deviation: NDArray[np.floating]
+    level: NDArray[np.floating], deviation: NDArray[np.floating], rises: bool = False
 ) -> tuple[float, float]:
     """Return the constant, and the gain, of the variance of deviations (n,) at levels (n,).
 
     The variance is estimated robustly at pixels of about the same level. It rises with the light,
     and falls with it in inverted and logarithmic images; it is negative nowhere up to most light.
+    rises: whether it is known not to fall.
     """
     parts = np.array_split(np.argsort(level), LEVELS)
     mean = np.array([np.median(level[part]) for part in parts])
@@ -156,11 +157,13 @@ def line_of_variance(
     variance = np.maximum(variance, MIN_VARIANCE)
     weight = 1 / variance
     most = max(float(level.max()), 1.0)
-    rows = np.column_stack([1 - mean / most, mean / most])
+    share = mean / most
+    rows = np.column_stack([np.ones_like(share) if rises else 1 - share, share])
     for _ in range(3):
         ends, _ = nnls(rows * weight[:, None], variance * weight)
         weight = 1 / np.maximum(rows @ ends, MIN_VARIANCE)
-    return max(float(ends[0]), MIN_VARIANCE), float(ends[1] - ends[0]) / most
+    rise = ends[1] if rises else ends[1] - ends[0]
+    return max(float(ends[0]), MIN_VARIANCE), float(rise) / most
 
 
 def _seen_by(kernel: NDArray[np.float64], correlation: NDArray[np.float64]) -> float:

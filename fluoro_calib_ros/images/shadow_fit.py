@@ -414,7 +414,8 @@ def noise_of_windows(fit: ShadowFit) -> Noise:
     level, deviation = _deviations(fit)
     if len(level) < MIN_PIXELS:
         return fit.noise
-    constant, gain = line_of_variance(level, deviation)
+    # In shadows, deficiencies of the profile look like noise that falls with the light.
+    constant, gain = line_of_variance(level, deviation, rises=fit.noise.gain > 0)
     return replace(fit.noise, constant=constant, gain=gain)
 
 

@@ -27,18 +27,16 @@ import numpy as np
 import pandas
 from scipy.spatial import cKDTree
 
-from fluoro_calib_ros.exposures.phantom import Drawing
 from tools.sections import write_section
 
-from .real_radiographs import C_ARM, DIAMETERS, FIDUCIAL, IMAGES, LARGE
+from .real_radiographs import C_ARM, DIAMETERS, FIDUCIAL, IMAGES, LARGE, SHEET
 from .sheet_and_cube import Undistortion, command, local_weighted_mean, sheet_in_image
 
 ARM = 'c_arm'
 SIZE = (1024, 1024)
 # The coordinates of the fiducial fit its images to 0.7 px without any correction.
 FIDUCIAL_SD_MM = 0.5
-PITCH_MM, SHEET_SD_MM = 3.0, 0.02
-SHEET = Drawing(80, 90, pitch_mm=(PITCH_MM,) * 3, hexagonal=True)
+SHEET_SD_MM = 0.02
 DIRECTIONS = (
     *('centred', 'orbit 15', 'orbit 30', 'orbit 45', 'orbit 60'),
     *('tilt 15', 'tilt 30', 'tilt 45', 'tilt 60'),
@@ -109,7 +107,7 @@ class Workplace:
         columns = [ids, *FIDUCIAL.T, np.full(len(ids), FIDUCIAL_SD_MM), diameter]
         names = ('target_id', *'xyz', 'sd', 'diameter')
         pandas.DataFrame(dict(zip(names, columns))).to_csv(folder / 'fiducial.csv', index=False)
-        drawing = ['--hex', f'{SHEET.columns}x{SHEET.rows}', '--pitch', f'{PITCH_MM}']
+        drawing = ['--hex', f'{SHEET.columns}x{SHEET.rows}', '--pitch', f'{SHEET.pitch_mm[0]}']
         drawing += ['--sd', f'{SHEET_SD_MM}', '--add-to', 'fiducial.csv', 'both.csv']
         command(folder, 'phantom', *drawing)
         out = ['--fluoroscope', ARM, '--out', 'points.csv']

@@ -107,6 +107,7 @@ FIDUCIAL = np.array(
 )
 LARGE = (8, 12)
 DIAMETERS = (4.5, 7.5)  # [mm] at that scale, from the shadows at half contrast
+SHEET = Drawing(80, 90, pitch_mm=(3.0, 3.0, 3.0), hexagonal=True)  # larger than the image
 REACH = (1.5, 2.0)  # radii of the ring of light around a shadow, relative to its radius
 WRONG_PX = 3.0
 
@@ -143,8 +144,7 @@ class RadiographSet:
 
 
 def _sheet() -> PhantomModel:
-    phantom = Drawing(80, 90, pitch_mm=(3.0, 3.0, 3.0), hexagonal=True).phantom()
-    return PhantomModel.of(phantom.xyz_mm, None, True)
+    return PhantomModel.of(SHEET.phantom().xyz_mm, None, True)
 
 
 def _plate() -> PhantomModel:

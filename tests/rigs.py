@@ -13,10 +13,11 @@ import pytest
 
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.correction.angle_field import AngleField
-from fluoro_calib_ros.correction.calibration_record import HARMONICS, SD_GRID, TERMS, VARIANCES
+from fluoro_calib_ros.correction.calibration_record import HARMONICS, SD_GRID, VARIANCES
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.correction.registry import model_type, no_correction
 from fluoro_calib_ros.correction.series import Functions, Series
+from fluoro_calib_ros.correction.terms import polynomial_powers
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
@@ -320,17 +321,21 @@ def smooth_pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCali
 
 
 def turning(
-    calibration: FluoroscopeCalibration, degrees: float = 60.0, size_px: float = 1.0
+    calibration: FluoroscopeCalibration,
+    degrees: float = 60.0,
+    size_px: float = 1.0,
+    degree: int = 3,
 ) -> FluoroscopeCalibration:
     """Return a calibration whose correction also changes with an angle, as for a C-arm.
 
-    The calibrated angles are up to +-degrees; size_px: deviation of coefficients per harmonic.
+    The calibrated angles are up to +-degrees; size_px: deviation of coefficients per harmonic;
+    degree: of the change.
     """
     rng = np.random.default_rng(5)
     field = AngleField(
         calibration.image_size,
         np.deg2rad(np.linspace(-degrees, degrees, 9)),
-        rng.normal(0, size_px, (HARMONICS, 2, TERMS)),
+        rng.normal(0, size_px, (HARMONICS, 2, len(polynomial_powers(degree)))),
         rng.uniform(0, 1e-3, (VARIANCES, SD_GRID, SD_GRID)),
     )
     return replace(calibration, angle_field=field)

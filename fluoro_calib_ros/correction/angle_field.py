@@ -14,15 +14,14 @@ by their mean over the exposures, each with a field of its own (see `exposure_te
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .calibration_record import HARMONICS, ORDERS, SD_GRID, VARIANCES
+from .calibration_record import DEGREES, HARMONICS, ORDERS, SD_GRID, TERMS, VARIANCES
 from .series import Functions, Series, at_sd_grid, sd_grid_pixels
-from .terms import CUBIC
 
 PAIRS = [(j, k) for j in range(HARMONICS) for k in range(j, HARMONICS)]
 MAX_DISTANCE = np.deg2rad(15)  # maximum angle to the nearest calibrated angle [rad]
@@ -39,7 +38,7 @@ def harmonics(angle: ArrayLike) -> NDArray[np.float64]:
 class _Change:
     """Change of a correction at an angle."""
 
-    #: (k, 2, 10) of the functions, for u and v: first the change, then fields of its uncertainty
+    #: (k, 2, t) of the functions, for u and v: first the change, then fields of its uncertainty
     coefficients: NDArray[np.float64]
     variance: NDArray[np.float64]  #: (33, 33) on the grid of the standard deviation [px^2]
 
@@ -53,22 +52,22 @@ class AngleField:
 
     image_size: tuple[int, int]  #: width and height [px]
     angles: NDArray[np.float64]  #: (e,) angles of the exposures [rad]
-    #: (4, 2, 10) fields of the harmonics less their means: coefficients of cubic polynomials of
-    #: the pixel for u and v, in the order and coordinates of `series.Functions` [px]
+    #: (4, 2, t) fields of the harmonics less their means: coefficients of polynomials of the pixel
+    #: of degree 3 or 5 for u and v, in the order and coordinates of `series.Functions` [px]
     coefficients: NDArray[np.float64]
     #: (14, 33, 33) on the grid of the standard deviation of a series [px^2]: covariances of the
     #: angle-independent correction with each harmonic, then covariances of the pairs of harmonics
     variances: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        shapes = {
-            'angles': (len(self.angles),),
-            'coefficients': (HARMONICS, 2, len(self._functions)),
-            'variances': (VARIANCES, SD_GRID, SD_GRID),
+        shapes: dict[str, list[tuple[int, ...]]] = {
+            'angles': [(len(self.angles),)],
+            'coefficients': [(HARMONICS, 2, terms) for terms in TERMS],
+            'variances': [(VARIANCES, SD_GRID, SD_GRID)],
         }
-        for name, shape in shapes.items():
+        for name, possible in shapes.items():
             values = np.ascontiguousarray(getattr(self, name), dtype=float)
-            if values.shape != shape or not values.size:
+            if values.shape not in possible or not values.size:
                 raise ValueError(f'{name} of an angle field have shape {values.shape}')
             if not np.isfinite(values).all():
                 raise ValueError(f'{name} of an angle field are not all finite')
@@ -76,7 +75,7 @@ class AngleField:
 
     @cached_property
     def _functions(self) -> Functions:
-        return Functions(self.image_size, CUBIC)
+        return Functions(self.image_size, DEGREES[TERMS.index(self.coefficients.shape[-1])])
 
     @cached_property
     def _mean(self) -> NDArray[np.float64]:
@@ -142,12 +141,14 @@ class AngleField:
         """Return a series with the change at an angle [rad] added, and its standard deviations."""
         weights = harmonics(angle) - self._mean
         change = np.tensordot(weights, self.coefficients, axes=1)
-        functions = series.functions
+        degree = max(series.functions.degree, self._functions.degree)
+        functions = replace(series.functions, degree=degree)
         _, variance = self._change_at(sd_grid_pixels(self.image_size), angle)
+        coefficients = functions.converted(series.functions, series.coefficients.ravel())
+        coefficients += functions.converted(self._functions, change.ravel())
         return Series(
             functions,
-            series.coefficients
-            + functions.converted(self._functions, change.ravel()).reshape(2, -1),
+            coefficients.reshape(2, -1),
             np.sqrt(np.maximum(series.sd**2 + variance.reshape(series.sd.shape), 0)),
         )
 
@@ -195,7 +196,7 @@ class AngleField:
     def _values(
         self, uv: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return values (n, k, 2) of k fields from their coefficients (k, 2, 10)."""
+        """Return values (n, k, 2) of k fields from their coefficients (k, 2, t)."""
         flat = coefficients.reshape(-1, coefficients.shape[-1])
         return (self._functions(uv) @ flat.T).reshape(len(uv), *coefficients.shape[:2])
 
@@ -203,7 +204,7 @@ class AngleField:
 def packed_angles(
     field: AngleField | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return angles (e,), coefficients (4, 2, 10) and variances (14, 33, 33) for files, messages.
+    """Return angles (e,), coefficients (4, 2, t) and variances (14, 33, 33) for files, messages.
 
     Returns empty arrays for None.
     """

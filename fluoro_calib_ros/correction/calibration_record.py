@@ -22,7 +22,7 @@ import numpy as np
 
 from ..exposures.frame import MAX_ANGLE
 from ..limits import MAX_ANGLES, MAX_IMAGE_SIDE, MAX_NEIGHBOURS, MAX_PRINCIPAL_DISTANCE_PX, MAX_PX
-from .terms import CUBIC
+from .terms import CUBIC, QUINTIC, polynomial_powers
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Field:
     minimum: float | None = None
     maximum: float | None = None  #: maximum of the absolute value of finite numbers
     longest: int | None = None  #: maximum length that a letter can stand for
-    #: the only length other than 0 that a letter of the shape can stand for
-    lengths: Mapping[str, int] = field(default_factory=dict)
+    #: lengths other than 0 that a letter of the shape can stand for
+    lengths: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     allowed: str = ''  #: value that a float can have besides finite ones: {'', 'inf', 'nan'}
     since: int = 1  #: first version of the file that has the field
     before: Any = None  #: value assumed for a record of an earlier version
@@ -57,7 +57,8 @@ MAX_MODES = 100  # maximum number of modes of a series on reading
 SD_GRID = 33  # nodes of the standard deviation along each side of the image
 ORDERS = 2  # number of harmonics of the angle
 HARMONICS = 2 * ORDERS
-TERMS = (CUBIC + 1) * (CUBIC + 2) // 2  # number of terms of a cubic polynomial of two variables
+DEGREES = (CUBIC, QUINTIC)  # degrees of the polynomials that a harmonic of the angle adds
+TERMS = tuple(len(polynomial_powers(degree)) for degree in DEGREES)
 VARIANCES = HARMONICS + HARMONICS * (HARMONICS + 1) // 2  # with the series, and of each pair
 
 _correction = partial(Field, identity='correction')
@@ -187,7 +188,7 @@ FIELDS = (
         f'S = {SD_GRID}; (0, 0) without a series',
         ('S', 'S'),
         minimum=0,
-        lengths={'S': SD_GRID},
+        lengths={'S': (SD_GRID,)},
         since=2,
         before=np.zeros((0, 0)),
     ),
@@ -205,9 +206,9 @@ FIELDS = (
     _pixels(
         'angle_coefficients',
         'coefficients in u and v of what each harmonic of the angle adds, '
-        f'H = {HARMONICS}, T = {TERMS}; (0, 2, 0) without angles',
+        f'H = {HARMONICS}, T = {TERMS[0]} or {TERMS[1]}; (0, 2, 0) without angles',
         ('H', 2, 'T'),
-        lengths={'H': HARMONICS, 'T': TERMS},
+        lengths={'H': (HARMONICS,), 'T': TERMS},
         since=3,
         before=np.zeros((0, 2, 0)),
     ),
@@ -219,7 +220,7 @@ FIELDS = (
         'covariances of these fields on the grid of `series_sd`, '
         f'V = {VARIANCES}, G = {SD_GRID}; (0, 0, 0) without angles',
         maximum=MAX_PX**2,
-        lengths={'V': VARIANCES, 'G': SD_GRID},
+        lengths={'V': (VARIANCES,), 'G': (SD_GRID,)},
         since=3,
         before=np.zeros((0, 0, 0)),
     ),

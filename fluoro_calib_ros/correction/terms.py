@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 HIGHEST = 7  # degree of the highest term
 CUBIC = 3  # degree of the cubic trend
+QUINTIC = 5  # highest degree of a change between exposures
 # Variance [px^2] of a term that is absent. Its amplitude of 1e-4 px is negligible; 1e-12 makes
 # normal matrices singular.
 ABSENT_VARIANCE = 1e-8

@@ -5,8 +5,11 @@
 
 The magnetic field about an image intensifier, and so its distortion, changes with the angle of a
 C-arm. The change is smooth: the 14 terms of the cubic trend, without what the orientation of an
-exposure absorbs, describe it (Gronenschild, Medical Physics 26, 1999). Their coefficients are
-random effects with mean zero (Robinson, "That BLUP is a good thing", Statistical Science 6, 1991).
+exposure absorbs, describe it (Gronenschild, Medical Physics 26, 1999). A field across the axis
+shifts a pixel by r^4 too: where the residuals show more, the terms reach degree 5
+(docs/how_good/real_radiographs.md: cubic terms leave 0.058 px of a real C-arm, quartic 0.028,
+quintic 0.025, noise 0.021). Their coefficients are random effects with mean zero (Robinson, "That
+BLUP is a good thing", Statistical Science 6, 1991).
 The variance of each term over the exposures is the one with the largest marginal likelihood
 (MacKay, Neural Computation 4, 1992), and vanishes where nothing changes.
 
@@ -31,7 +34,14 @@ from numpy.typing import NDArray
 from ..correction.angle_field import PAIRS, AngleField, harmonics
 from ..correction.calibration_record import HARMONICS, ORDERS, SD_GRID, VARIANCES
 from ..correction.series import Functions, sd_grid_pixels
-from ..correction.terms import ABSENT_VARIANCE, CUBIC, cubic_terms, trend_transformation
+from ..correction.terms import (
+    ABSENT_VARIANCE,
+    CUBIC,
+    GAUGE,
+    cubic_terms,
+    polynomial_powers,
+    trend_transformation,
+)
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import (
     AdditionalParameters,
@@ -55,7 +65,8 @@ VARYING = 0.85
 # Prior degrees of freedom of the variances of a change of the interior orientation: the number of
 # exposures that the other terms count as. Variances of the terms of a smooth field scatter so.
 LIKE_OTHERS = 4
-MIN_POINTS = 30  # image points of an exposure whose terms are tested
+MIN_OBSERVATIONS = 3  # for each unknown of an exposure whose terms are tested
+MIN_POINTS = MIN_OBSERVATIONS * (TERMS + POSE_SIZE) // 2  # image points, for cubic terms
 
 
 @dataclass(frozen=True)
@@ -79,22 +90,27 @@ def exposure_functions(
     interior: NDArray[np.float64],
     with_interior: bool = False,
     kind: GaugeKind = GaugeKind.FULL,
+    degree: int = CUBIC,
 ) -> NDArray[np.float64]:
-    """Return values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and of RMS one.
+    """Return values (N, 2, t) of the terms at pixels uv (N, 2), orthogonal and of RMS one.
 
-    They are orthogonal to the gauge about interior (3,), which orientations absorb. with_interior:
-    add three terms for a change of the interior orientation, which is the part of the gauge that a
-    rotation of the sensor does not absorb. kind TREND: they complete the gauge to all cubic
-    polynomials, as the gauge of the series requires; the sum of a series and of orthogonal terms
-    could be a tilt, and nothing else determines the tilt of targets parallel to the image.
+    The first 14 are cubic; degree 5 adds 22. They are orthogonal to the gauge about interior (3,),
+    which orientations absorb. with_interior: add three terms for a change of the interior
+    orientation, which is the part of the gauge that a rotation of the sensor does not absorb. kind
+    TREND: the first complete the gauge to all cubic polynomials, as the gauge of the series
+    requires; the sum of a series and of orthogonal terms could be a tilt, and nothing else
+    determines the tilt of targets parallel to the image.
     """
     to_terms, count = trend_transformation(CUBIC)
     as_polynomials = np.linalg.inv(to_terms)[:, :count].reshape(2, -1, count)
     values = np.einsum('nm,amt->nat', Functions(image_size, CUBIC)(uv), as_polynomials)
     gauge = gauge_basis(uv, interior)
     apart = gauge_basis(uv, interior, GaugeKind.NONE) if kind is GaugeKind.TREND else gauge
-    columns = np.concatenate([apart, values], axis=2).reshape(2 * len(uv), -1)
-    q = np.linalg.qr(columns)[0][:, apart.shape[2] :]
+    q = _orthogonal(apart, values)
+    if degree > CUBIC:
+        q = np.hstack(
+            [q, _orthogonal(np.dstack([gauge, values]), _higher(uv, image_size, degree))]
+        )
     if with_interior:
         turns = gauge_basis(uv, interior, GaugeKind.TURNS).reshape(2 * len(uv), -1)
         turns = np.linalg.qr(turns)[0]
@@ -104,19 +120,45 @@ def exposure_functions(
     return q.reshape(len(uv), 2, -1) * np.sqrt(2 * len(uv))
 
 
+def _orthogonal(
+    others: NDArray[np.float64], functions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return an orthonormal basis (2 n, t) of functions (n, 2, t), orthogonal to others (n, 2, k).
+
+    It is that of Gram and Schmidt, in the order of the functions.
+    """
+    columns = np.dstack([others, functions]).reshape(2 * len(functions), -1)
+    return np.linalg.qr(columns)[0][:, others.shape[2] :]
+
+
+def _higher(
+    uv: NDArray[np.float64], image_size: tuple[int, int], degree: int
+) -> NDArray[np.float64]:
+    """Return the polynomials (n, 2, t) beyond cubic ones, for u and then for v."""
+    functions = Functions(image_size, degree)
+    values = functions(uv)[:, np.sum(functions.powers, axis=1) > CUBIC]
+    zeros = np.zeros_like(values)
+    return np.stack([np.hstack([values, zeros]), np.hstack([zeros, values])], axis=1)
+
+
 def is_determined(exposure: NDArray[np.int64], fewest: int) -> bool:
     """Return whether at least `fewest` of the exposures (n,) have enough image points."""
     return int(np.sum(np.unique(exposure, return_counts=True)[1] >= MIN_POINTS)) >= fewest
 
 
 def variation(
-    residuals: NDArray[np.float64], exposure: NDArray[np.int64], functions: NDArray[np.float64]
+    residuals: NDArray[np.float64],
+    exposure: NDArray[np.int64],
+    functions: NDArray[np.float64],
+    first: int = 0,
 ) -> Variation:
     """Return the change of the distortion that residuals show.
 
-    residuals (n, 2) [px] of inliers, their exposures (n,), and the values (n, 2, 14) of
-    `exposure_functions`. The noise variance is that of the residuals after a fit of the terms.
+    residuals (n, 2) [px] of inliers, their exposures (n,), and the values (n, 2, t) of
+    `exposure_functions`. first: term from which on they are tested, beside those before. The noise
+    variance is that of the residuals after a fit of the terms.
     """
+    fewest = MIN_OBSERVATIONS * (functions.shape[2] + POSE_SIZE) // 2
     explained = 0.0
     unexplained = 0.0
     dof = 0
@@ -124,14 +166,14 @@ def variation(
     points = 0
     for number in np.unique(exposure):
         rows = exposure == number
-        if rows.sum() < MIN_POINTS:
+        if rows.sum() < fewest:
             continue
         a = functions[rows].reshape(-1, functions.shape[2])
         q, _ = np.linalg.qr(a)
-        square = float(np.sum((q.T @ residuals[rows].ravel()) ** 2))
-        explained += square
-        unexplained += float(np.sum(residuals[rows] ** 2)) - square
-        dof += a.shape[1]
+        squares = (q.T @ residuals[rows].ravel()) ** 2
+        explained += float(np.sum(squares[first:]))
+        unexplained += float(np.sum(residuals[rows] ** 2) - np.sum(squares))
+        dof += a.shape[1] - first
         dof_left += len(a) - a.shape[1] - POSE_SIZE
         points += len(a)
     if not dof or unexplained <= 0:
@@ -146,19 +188,24 @@ class ExposureTerms:
     """Terms of every exposure of a fluoroscope as additional parameters.
 
     Coefficients are ordered exposure by exposure. size_px: initial RMS of a coordinate of the
-    change [px].
+    change [px]. degree: of the polynomials.
     """
 
     def __init__(
-        self, functions: NDArray[np.float64], exposure: NDArray[np.int64], size_px: float
+        self,
+        functions: NDArray[np.float64],
+        exposure: NDArray[np.int64],
+        size_px: float,
+        degree: int = CUBIC,
     ) -> None:
+        self.degree = degree
         numbers, place = np.unique(exposure, return_inverse=True)
         self.exposures = len(numbers)
         #: functions at the image points; the groups are the exposures
         self.functions = GroupedFunctions(functions, place)
         count = functions.shape[2]
-        #: (t,) variance of the coefficients of each term over the exposures [px^2]; t: 14, or 17
-        #: with a change of the interior orientation
+        #: (t,) variance of the coefficients of each term over the exposures [px^2]; t: 14 or 36,
+        #: and 3 for a change of the interior orientation
         self.variance = np.full(count, max(size_px**2 / count, ABSENT_VARIANCE))
 
     @property
@@ -183,7 +230,8 @@ class ExposureTerms:
         determined = np.clip(1 - posterior / self.variance, 1e-6, 1).sum(axis=0)
         squares = np.sum(mean**2, axis=0)
         typical = np.sum(squares[:TERMS]) / np.sum(determined[:TERMS])
-        is_interior = np.arange(len(squares)) >= TERMS
+        polynomials = 2 * len(polynomial_powers(self.degree)) - len(GAUGE)
+        is_interior = np.arange(len(squares)) >= polynomials
         squares = squares + LIKE_OTHERS * typical * is_interior
         # The mean of inverse chi squared has two degrees of freedom less.
         exposures = determined + (LIKE_OTHERS - 2) * is_interior
@@ -477,16 +525,16 @@ def field_of(
 ) -> AngleField:
     """Return the field of the effects of angles (e,) [rad] on estimated terms."""
     size = estimated.functions.image_size
-    cubic = Functions(size, CUBIC)
-    values = cubic(estimated.uv)
+    powers = Functions(size, estimated.terms.degree)
+    values = powers(estimated.uv)
     term_values = estimated.terms.functions.values
-    # This solution is exact, because the terms are cubic polynomials.
-    to_cubic = [np.linalg.lstsq(values, term_values[:, axis], rcond=None)[0] for axis in (0, 1)]
+    # This solution is exact, because the terms are polynomials.
+    to_powers = [np.linalg.lstsq(values, term_values[:, axis], rcond=None)[0] for axis in (0, 1)]
     by_harmonic = effects.mean.reshape(HARMONICS, -1)
-    coefficients = np.stack([by_harmonic @ matrix.T for matrix in to_cubic], axis=1)
+    coefficients = np.stack([by_harmonic @ matrix.T for matrix in to_powers], axis=1)
     pixels = sd_grid_pixels(size)
     series = estimated.functions(pixels)
-    terms = [cubic(pixels) @ matrix for matrix in to_cubic]
+    terms = [powers(pixels) @ matrix for matrix in to_powers]
     m = series.shape[1]
     count = by_harmonic.shape[1]
     cross = effects.mixed.reshape(2, m, HARMONICS, count)

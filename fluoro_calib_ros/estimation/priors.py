@@ -27,9 +27,10 @@ from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_
 from .parametric import covariance_with_uncertain_terms
 from .signal import Signal, SignalEquations, most_likely_signal, plausible_signals, starting_signal
 
-# Standard deviation that fixes the gauge; a much smaller value would damp the steps of the
-# adjustment.
-GAUGE_SD_PX = 3e-5
+# Standard deviation that fixes the gauge. With ten times as much it would show in the standard
+# deviation of a correction (0.005 px where they are best). With a tenth, its large weights damp
+# the steps of the adjustment, and rounding of F exceeds the tolerance (31,000 image points: 5e-4).
+GAUGE_SD_PX = 3e-4
 # Prior variance of a non-existing trend term, relative to the variance of its estimate.
 MIN_RELATIVE_VARIANCE = 1e-3
 MAX_VARIANCE = 1e8  # largest prior variance of a trend term

@@ -16,9 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from ..correction.terms import CUBIC, QUINTIC
 from ..photogrammetry.adjustment import Adjustment
 from .estimator import GaugeKind, coefficients_of
-from .exposure_terms import ExposureTerms, can_be_fitted, exposure_functions, variation
+from .exposure_terms import (
+    TERMS,
+    ExposureTerms,
+    can_be_fitted,
+    exposure_functions,
+    variation,
+)
 from .fluoroscope_terms import FluoroscopeTerms
 from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
 from .priors import Prior, SeriesEquations, prior_precision, with_shown_places
@@ -37,6 +44,9 @@ NEGLIGIBLE = 0.2
 # A smaller number of modes must be below this part of the present one: nearly half the functions.
 FEWER_MODES = 0.75
 MODE_CHANGES = 3  # most changes, so that numbers do not alternate for ever
+# The same statistic as `exposure_terms.VARYING`, for terms beyond cubic ones: their estimates then
+# contain more change than noise. Independent residuals have at most 1.
+MORE_THAN_NOISE = 2.0
 MAX_VARYING_EXPOSURES = 60  # exposures of a fluoroscope with terms of their own; limits the time
 
 
@@ -182,22 +192,21 @@ def exposure_terms(solution: Solution) -> Changes:
     for part in solution.parts:
         modes = min(part.functions.complete, START_MODES)
         out[part.number] = Change(modes)
-        functions = exposure_functions(part.uv, part.image_size, part.interior)
-        inliers = solution.adjustment.inliers[part.rows]
-        shown = variation(
-            solution.adjustment.residuals[part.rows][inliers],
-            part.exposure[inliers],
-            functions[inliers],
-        )
-        has_few_exposures = len(np.unique(part.exposure)) <= MAX_VARYING_EXPOSURES
-        if not shown.is_varying or not has_few_exposures:
+        if len(np.unique(part.exposure)) > MAX_VARYING_EXPOSURES:
             continue
+        points = part.inliers(solution.adjustment)
+        gauge = part.image_size, part.interior
+        functions = exposure_functions(points.uv, *gauge, degree=QUINTIC)
+        cubic = variation(points.residuals, points.exposure, functions[:, :, :TERMS])
+        if not cubic.is_varying:
+            continue
+        higher = variation(points.residuals, points.exposure, functions, TERMS)
+        degree = QUINTIC if higher.chi2_per_dof > MORE_THAN_NOISE else CUBIC
         kind = GaugeKind.TREND if part.gauge_kind is GaugeKind.TREND else GaugeKind.FULL
-        with_interior = can_be_fitted(part.angles)
         functions = exposure_functions(
-            part.uv, part.image_size, part.interior, with_interior, kind
+            part.uv, *gauge, with_interior=can_be_fitted(part.angles), kind=kind, degree=degree
         )
-        own = ExposureTerms(functions, part.exposure, shown.size_px)
+        own = ExposureTerms(functions, part.exposure, cubic.size_px, degree)
         out[part.number] = Change(modes, own=own)
     return out if any(change.own is not None for change in out.values()) else {}
 

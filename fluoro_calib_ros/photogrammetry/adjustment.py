@@ -6,13 +6,15 @@
 For a given noise model, maximise the likelihood of the image points (Student-t, Huber or Gaussian)
 and of the surveyed coordinates (Gaussian; they define the datum unless inner constraints do). The
 solver is Levenberg-Marquardt with Nielsen's damping (Madsen, Nielsen and Tingleff, "Methods for
-non-linear least squares problems", DTU 2004), iteratively reweighted. `outliers` estimates the
-noise model in an outer loop.
+non-linear least squares problems", DTU 2004), iteratively reweighted. Between two linearisations
+it takes quasi-Newton steps. `outliers` estimates the noise model in an outer loop.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -32,12 +34,10 @@ from .unknowns import Parameters, discrepancies
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-12
 UNDAMPED = 1e-6  # damping that changes no covariance visibly
-# A step with the same normal matrix saves time if it predicts less than this part of the last
-# decrease of F.
-REPEATED = 0.5
-# Largest decrease of F for each image point by a step with the last normal matrix: larger steps
-# change the weights of the image points.
-REPEATED_DECREASE = 0.01
+# Largest decrease of F for each image point after which the last normal matrix still describes the
+# solution: a larger one changes the weights of the image points.
+SAME_WEIGHTS_DECREASE = 0.01
+SECANTS = 10  # secants of quasi-Newton steps; 3 to 20 are usual (Nocedal and Wright, p. 177)
 TOLERANCE = 1e-8  # predicted decrease of the cost F at which an adjustment ends
 MAX_STEPS = 100  # largest number of steps of an adjustment, including refused steps
 
@@ -129,11 +129,52 @@ class _Solver:
 
 @dataclass(frozen=True)
 class _Step:
-    """A step from `BorderedFactor.solve`, and the decrease of F that it predicts."""
+    """A step (x,) of the unknowns in the order of elimination, and its predicted decrease of F."""
 
-    x_blocks: NDArray[np.float64]
-    x_rest: NDArray[np.float64]
+    x: NDArray[np.float64]
     predicted: float
+
+
+class _Secants:
+    """Inverse of the matrix of second derivatives of F, corrected by the last steps.
+
+    Limited-memory BFGS (Nocedal and Wright, "Numerical Optimization", 2nd ed. 2006, algorithm
+    7.4), with a factorized normal matrix as initial approximation. With redescending weights the
+    normal matrix is far larger than the second derivatives in some directions, and steps with it
+    alone creep. Positions where the gradient was evaluated are in the order of their steps.
+    """
+
+    def __init__(self) -> None:
+        self._pairs: deque[tuple[NDArray[np.float64], NDArray[np.float64]]] = deque(maxlen=SECANTS)
+        self._right: NDArray[np.float64] | None = None  # at the last position
+        self._step: NDArray[np.float64] | None = None  # from there
+
+    def moved(self, step: NDArray[np.float64]) -> None:
+        """Note the step (x,) that was accepted at the last position."""
+        self._step = step
+
+    def arrived(self, right: NDArray[np.float64]) -> None:
+        """Note the right side (x,), the negative gradient, at the present position."""
+        if self._step is not None and self._right is not None:
+            change = self._right - right
+            if self._step @ change > 0:  # keeps the matrix positive definite
+                self._pairs.append((self._step, change))
+        self._right, self._step = right, None
+
+    def step(
+        self, solve: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Return the quasi-Newton step (x,); solve: multiply by the initial approximation."""
+        assert self._right is not None
+        remainder = self._right
+        shares = []
+        for step, change in reversed(self._pairs):
+            shares.append((step @ remainder) / (step @ change))
+            remainder = remainder - shares[-1] * change
+        out = solve(remainder)
+        for (step, change), share in zip(self._pairs, reversed(shares)):
+            out = out + (share - (change @ out) / (step @ change)) * step
+        return out
 
 
 @dataclass(frozen=True)
@@ -163,29 +204,48 @@ class _Problem:
         """
         return _Solver(system, system.damped(mu).factorize(), mu)
 
-    def at(self, parameters: Parameters, solver: _Solver) -> _Solver:
-        """Return the same factors with the right sides at other parameters."""
+    def right(self, parameters: Parameters) -> NDArray[np.float64]:
+        """Return the right side (x,) of the normal equations, without their matrix."""
         right = right_sides(self.network, parameters, self.correction, self.noise)
         block_right, rest_right = self.elimination.right_sides(right)
-        system = replace(solver.system, block_right=block_right, rest_right=rest_right)
-        return replace(solver, system=system)
+        return np.concatenate([block_right.ravel(), rest_right])
 
-    def step(self, solver: _Solver) -> _Step:
-        """Return the step that solves the normal equations."""
-        system = solver.system
-        x_blocks, x_rest = solver.factor.solve(system.block_right, system.rest_right)
-        predicted = system.predicted_decrease(x_blocks, x_rest, solver.mu)
-        return _Step(x_blocks, x_rest, predicted)
-
-    def after(self, iterate: _Iterate, step: _Step) -> _Iterate:
-        """Return the iterate after a step.
+    def newton_step(self, solver: _Solver, iterate: _Iterate) -> _Step:
+        """Return the step that solves the normal equations at an iterate.
 
         The robustly weighted normal matrix is larger than the Fisher information. With heavy
         tails, steps stretched by their ratio converge in a third of the iterations.
         """
+        system = solver.system
+        x_blocks, x_rest = solver.factor.solve(system.block_right, system.rest_right)
+        predicted = system.predicted_decrease(x_blocks, x_rest, solver.mu)
         stretch = 1 / self.noise.information_factor(iterate.q)
-        x = self.elimination.to_unknowns(stretch * step.x_blocks, stretch * step.x_rest)
+        return _Step(stretch * np.concatenate([x_blocks.ravel(), x_rest]), predicted)
+
+    def secant_step(self, solver: _Solver, iterate: _Iterate, secants: _Secants) -> _Step:
+        """Return the quasi-Newton step at an iterate, with a solver of an earlier one."""
+        stretch = 1 / self.noise.information_factor(iterate.q)
+        right = self.right(iterate.parameters)
+        secants.arrived(right)
+
+        def solve(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            x_blocks, x_rest = solver.factor.solve(*self._split(values))
+            return stretch * np.concatenate([x_blocks.ravel(), x_rest])
+
+        x = secants.step(solve)
+        return _Step(x, float(right @ x) / 2)
+
+    def after(self, iterate: _Iterate, step: _Step) -> _Iterate:
+        """Return the iterate after a step."""
+        x = self.elimination.to_unknowns(*self._split(step.x))
         return self.evaluate(self.network.parameters_after(iterate.parameters, x))
+
+    def _split(
+        self, values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return eliminated (k, s) and remaining (q,) values from those of all unknowns (x,)."""
+        eliminated = values[: len(values) - self.elimination.layout.size]
+        return eliminated.reshape(self.elimination.n_cells, -1), values[len(eliminated) :]
 
 
 class _NielsenDamping:
@@ -220,7 +280,7 @@ class _LevenbergMarquardt:
 
     `current` is the best iterate so far; `steps` is the number of steps, including refused steps.
     `finished` ends the iteration; `converged` is True at a minimum. `used` has the normal
-    equations of the last accepted step, or at the minimum; None with relative orientations.
+    equations at the minimum, or near it; None with relative orientations.
     """
 
     def __init__(self, problem: _Problem, start: Parameters, tolerance: float) -> None:
@@ -231,23 +291,32 @@ class _LevenbergMarquardt:
         self._problem = problem
         self._tolerance = tolerance
         self._damping = _NielsenDamping()
+        self._secants = _Secants()
         self._system: BorderedSystem | None = None  # at the current parameters
         self._last: _Solver | None = None  # solver of the last step, if it may be used again
-        self.used: _Solver | None = None
-        self._predicted = np.inf  # decrease of F by the last accepted step
+        self._cost_of_last = np.inf  # F where it was linearised
+        self._predicted = 0.0  # decrease of F by the last step that solves linearised equations
+        self._may_use_again = not problem.network.relative
+
+    @property
+    def used(self) -> _Solver | None:
+        """Solver of the last step, if the weights have hardly changed since."""
+        decrease = self._cost_of_last - self.current.cost
+        limit = SAME_WEIGHTS_DECREASE * self._problem.network.n_image_points
+        return self._last if decrease <= limit else None
 
     def step(self) -> None:
-        """Take or refuse one damped step."""
+        """Take or refuse one step."""
         self.steps += 1
-        if self._last is not None and self._repeat(self._last):
+        if self._last is not None and self._system is None and self._secant_step(self._last):
             return
-        self._last = None
         if self._system is None:
-            self.used = None  # free its memory before the next matrix is allocated
+            self._last = None  # free its memory before the next matrix is allocated
             self._system = self._problem.linearise(self.current.parameters)
+            self._secants.arrived(self._system.right)
         try:
             solver = self._problem.factorize(self._system, self._damping.mu)
-            step = self._problem.step(solver)
+            step = self._problem.newton_step(solver, self.current)
         except (np.linalg.LinAlgError, ValueError):
             self.finished = self._damping.refuse()
             return
@@ -259,44 +328,41 @@ class _LevenbergMarquardt:
             self.finished = self.converged or self._damping.refuse()
             return
         self._damping.accept((self.current.cost - trial.cost) / max(step.predicted, 1e-300))
+        self._predicted = step.predicted
         self._use(solver)
-        self._last = self.used
-        self._accept(trial, step.predicted)
+        self._accept(trial, step)
 
     def _use(self, solver: _Solver) -> None:
         """Keep the normal equations at the current parameters."""
-        if not self._problem.network.relative:
-            self.used = solver
+        if self._may_use_again:
+            self._last = solver
+            self._cost_of_last = self.current.cost
 
-    def _repeat(self, solver: _Solver) -> bool:
-        """Take a step with the factors of the last step; return False if they are unsuitable.
+    def _secant_step(self, solver: _Solver) -> bool:
+        """Take a quasi-Newton step with the factors of the last step; return False if it fails.
 
-        Near the solution the normal matrix hardly changes, and the simplified Newton method
-        converges as fast at a fraction of the cost (Deuflhard, "Newton Methods for Nonlinear
-        Problems", Springer 2011, 2.1.2).
+        It takes a fraction of the time of a linearisation.
         """
-        solver = self._problem.at(self.current.parameters, solver)
-        step = self._problem.step(solver)
-        limit = REPEATED_DECREASE * self._problem.network.n_image_points
-        # If an exposure had almost no weight, the step may be of any size, even infinite.
-        if not step.predicted <= min(REPEATED * self._predicted, limit):
+        step = self._problem.secant_step(solver, self.current, self._secants)
+        # Where the secants mislead, or an exposure had almost no weight, it may be of any size.
+        if not step.predicted <= self._predicted:
             return False
         trial = self._problem.after(self.current, step)
         if self._is_worse(trial):
             self.converged = step.predicted <= self._tolerance
             self.finished = self.converged
             return self.converged
-        self._accept(trial, step.predicted)
+        self._accept(trial, step)
         return True
 
     def _is_worse(self, trial: _Iterate) -> bool:
         return not trial.cost <= self.current.cost + ROUNDING * abs(self.current.cost)
 
-    def _accept(self, trial: _Iterate, predicted: float) -> None:
+    def _accept(self, trial: _Iterate, step: _Step) -> None:
         self.current = trial
         self._system = None
-        self._predicted = predicted
-        self.converged = predicted <= self._tolerance
+        self._secants.moved(step.x)
+        self.converged = step.predicted <= self._tolerance
         self.finished = self.converged
 
 

@@ -39,6 +39,11 @@ class BorderedSystem:
     block_right: NDArray[np.float64]  #: (k, s) right side b
     rest_right: NDArray[np.float64]  #: (q,) right side r
 
+    @property
+    def right(self) -> NDArray[np.float64]:
+        """Right side (x,): b, block by block, then r."""
+        return np.concatenate([self.block_right.ravel(), self.rest_right])
+
     def damped(self, mu: float) -> BorderedSystem:
         """Return a copy with the diagonal multiplied by 1 + mu."""
         blocks = self.blocks + mu * self.blocks * np.eye(self.blocks.shape[1])

@@ -4,6 +4,7 @@
 """Variance of the distortion between exposures, excluding what object points can absorb."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -410,10 +411,11 @@ def test_terms_beside_a_series_in_the_gauge_of_its_trend_are_in_that_gauge():
     """Otherwise a series and the terms of exposures could sum up to a tilt."""
     uv = np.random.default_rng(13).uniform(0, 1024, (300, 2))
     interior = np.array([511.5, 511.5, 4000.0])
-    for kind in (GaugeKind.FULL, GaugeKind.TREND):
-        functions = exposure_functions(uv, SIZE, interior, kind=kind)
-        flat = functions.reshape(600, 14)
-        np.testing.assert_allclose(flat.T @ flat / 600, np.eye(14), atol=1e-9)
+    for kind, degree in product((GaugeKind.FULL, GaugeKind.TREND), (3, 5)):
+        functions = exposure_functions(uv, SIZE, interior, kind=kind, degree=degree)
+        count = functions.shape[2]
+        flat = functions.reshape(600, count)
+        np.testing.assert_allclose(flat.T @ flat / 600, np.eye(count), atol=1e-9)
         parts = [gauge_coefficients(uv, f, interior, kind) for f in functions.transpose(2, 0, 1)]
         np.testing.assert_allclose(parts, 0, atol=1e-9)
 

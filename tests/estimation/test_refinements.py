@@ -9,8 +9,9 @@ import pytest
 
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.estimation import fluoroscope_terms
-from fluoro_calib_ros.estimation.estimator import GaugeKind
+from fluoro_calib_ros.estimation.estimator import GaugeKind, gauge_basis
 from fluoro_calib_ros.estimation.exposure_terms import exposure_functions
+from fluoro_calib_ros.estimation.lack_of_fit import FittedPoints
 from fluoro_calib_ros.estimation.priors import Prior, SeriesEquations
 from fluoro_calib_ros.estimation.refinements import (
     MAX_MODES,
@@ -104,8 +105,9 @@ def test_places_are_searched_only_next_to_others_and_a_few_times(
     assert part.prior is given and part.gauge == 'gauge'
 
 
-@pytest.mark.parametrize('varies', [False, True])
-def test_exposures_get_terms_of_their_own_only_where_they_differ(varies):
+@pytest.mark.parametrize('change, terms', [(None, 0), (2, 14), (4, 36)])
+def test_exposures_get_terms_of_their_own_only_where_they_differ(change, terms):
+    """A change of degree 2 needs cubic terms; one of degree 4 needs more."""
     rng = np.random.default_rng(4)
     uv = rng.uniform(0, 1024, (600, 2))
     exposure = np.repeat(np.arange(6), 100)
@@ -114,10 +116,12 @@ def test_exposures_get_terms_of_their_own_only_where_they_differ(varies):
     for own in np.arange(600).reshape(6, 100):  # orientations and beads absorb a part
         q, _ = np.linalg.qr(exposure_functions(uv, (1024, 1024), interior)[own].reshape(200, -1))
         residuals[own] -= (0.5 * q @ (q.T @ residuals[own].ravel())).reshape(-1, 2)
-    if varies:  # a stretch along the diagonal that changes from exposure to exposure
+    if terms:  # a stretch along the diagonal that changes from exposure to exposure
         xy = (uv - 511.5) / 512
-        change = np.column_stack([xy[:, 1] ** 2, xy[:, 0] ** 2])
-        residuals += change * np.linspace(-2, 2, 6)[exposure, None]
+        field = np.column_stack([xy[:, 1] ** change, xy[:, 0] ** change]).ravel()
+        gauge = gauge_basis(uv, interior).reshape(len(field), -1)
+        field -= gauge @ np.linalg.lstsq(gauge, field, rcond=None)[0]
+        residuals += field.reshape(-1, 2) * np.linspace(-2, 2, 6)[exposure, None]
     part = SimpleNamespace(
         number=0,
         uv=uv,
@@ -128,10 +132,11 @@ def test_exposures_get_terms_of_their_own_only_where_they_differ(varies):
         angles=np.full(6, np.nan),
         gauge_kind=GaugeKind.FULL,
         functions=SimpleNamespace(complete=40),
+        inliers=lambda adjustment: FittedPoints(uv, residuals, exposure),
     )
-    adjustment = SimpleNamespace(inliers=np.ones(len(uv), bool), residuals=residuals)
-    found = exposure_terms(SimpleNamespace(parts=[part], adjustment=adjustment))
-    assert bool(found) == varies
-    if varies:
+    found = exposure_terms(SimpleNamespace(parts=[part], adjustment=None))
+    assert bool(found) == bool(terms)
+    if terms:
+        assert found[0].own.count == 6 * terms
         assert set(found) == {0} and found[0].modes == START_MODES
         assert found[0].own.size_px > 0.3

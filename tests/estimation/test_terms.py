@@ -27,6 +27,7 @@ from fluoro_calib_ros.estimation.estimator import (
 )
 from fluoro_calib_ros.estimation.exposure_terms import ExposureTerms, exposure_functions
 from fluoro_calib_ros.estimation.fluoroscope_terms import MIN_START_SD_PX, FluoroscopeTerms
+from fluoro_calib_ros.estimation.lack_of_fit import FittedPoints
 from fluoro_calib_ros.estimation.parametric import ExpertTerms, StepwiseTerms
 from fluoro_calib_ros.estimation.priors import Prior, covariance_of_series, prior_precision
 from fluoro_calib_ros.estimation.refinements import (
@@ -627,9 +628,9 @@ def test_terms_of_exposures_that_follow_an_angle_have_those_of_the_interior():
             angles=angles,
             gauge_kind=GaugeKind.FULL,
             functions=SimpleNamespace(complete=modes),
+            inliers=lambda adjustment: FittedPoints(uv, residuals, numbers),
         )
-        adjustment = SimpleNamespace(inliers=np.ones(len(uv), bool), residuals=residuals)
-        there = SimpleNamespace(parts=[part], adjustment=adjustment)
+        there = SimpleNamespace(parts=[part], adjustment=None)
         return refinements.exposure_terms(there).get(0)
 
     known = proposed(np.linspace(-1, 1, exposures), 10)

@@ -39,12 +39,33 @@ def image_points(seed=0, count=100):
     return uv, np.repeat(np.arange(EXPOSURES), count), rng
 
 
-def test_terms_are_orthogonal_to_each_other_and_to_the_gauge():
+@pytest.mark.parametrize('degree, count', [(3, 14), (5, 36)])
+def test_terms_are_orthogonal_to_each_other_and_to_the_gauge(degree, count):
+    """Together with the gauge they are all polynomials of this degree; cubic ones are first."""
     uv, _, _ = image_points()
-    functions = exposure_functions(uv, SIZE, INTERIOR).reshape(-1, 14)
-    np.testing.assert_allclose(functions.T @ functions / len(functions), np.eye(14), atol=1e-9)
+    functions = exposure_functions(uv, SIZE, INTERIOR, degree=degree).reshape(-1, count)
+    np.testing.assert_allclose(functions.T @ functions / len(functions), np.eye(count), atol=1e-9)
     gauge = gauge_basis(uv, INTERIOR).reshape(len(functions), -1)
     np.testing.assert_allclose(gauge.T @ functions / len(functions), 0, atol=1e-9)
+    basis = np.hstack([gauge, functions])
+    values = np.random.default_rng(1).normal(0, 1, (2, len(Functions(SIZE, degree))))
+    polynomial = (Functions(SIZE, degree)(uv) @ values.T).ravel()
+    solution = np.linalg.lstsq(basis, polynomial, rcond=None)[0]
+    np.testing.assert_allclose(basis @ solution, polynomial, atol=1e-9)
+    cubic = exposure_functions(uv, SIZE, INTERIOR).reshape(-1, 14)
+    np.testing.assert_allclose(functions[:, :14], cubic, atol=1e-12)
+
+
+def test_terms_are_tested_beside_those_before_them():
+    """A cubic change is none of degree 4 or 5, though its terms in an exposure resemble them."""
+    uv, exposure, rng = image_points(4)
+    functions = exposure_functions(uv, SIZE, INTERIOR, degree=5)
+    noise = rng.normal(0, NOISE, uv.shape)
+    for amplitudes, low, high in ((14, 0.8, 1.2), (36, 3.0, np.inf)):
+        change = rng.normal(0, 0.3, (EXPOSURES, amplitudes))[exposure]
+        r = noise + np.einsum('nak,nk->na', functions[:, :, :amplitudes], change)
+        assert variation(r, exposure, functions[:, :, :14]).is_varying
+        assert low < variation(r, exposure, functions, 14).chi2_per_dof < high
 
 
 @pytest.mark.parametrize('size_px', [0.0, 0.15, 0.5])

@@ -44,9 +44,9 @@ def plain():
     return rigs.calibrated('a', 6, max_iterations=2).calibrations['a']
 
 
-@pytest.fixture(scope='module')
-def turning(plain):
-    return rigs.turning(plain)
+@pytest.fixture(scope='module', params=[3, 5])
+def turning(plain, request):
+    return rigs.turning(plain, degree=request.param)
 
 
 @functools.cache
@@ -91,7 +91,11 @@ def test_calibration_without_angles_has_empty_arrays(plain):
 @pytest.mark.parametrize(
     'name, values, said',
     [
-        ('angle_coefficients', [0.0] * 79, 'angle_coefficients has 79 values, 80 are expected'),
+        (
+            'angle_coefficients',
+            [0.0] * 79,
+            'angle_coefficients has 79 values, 80 or 168',
+        ),
         ('angle_coefficients', [], 'coefficients of an angle field have shape'),
         ('angle_variances', [0.0] * 33, 'angle_variances has 33 values, 15246 are expected'),
         ('angles', [], 'angles of an angle field'),

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -67,12 +69,12 @@ def _shaped(where: str, field: Field, flat: np.ndarray) -> np.ndarray:
         return flat
     if not len(flat) and field.before is not None:
         return np.asarray(field.before)
-    shape = [field.lengths[n] if isinstance(n, str) else n for n in field.shape]
-    if len(flat) != np.prod(shape):
-        raise DataError(
-            f'{where}: {field.name} has {len(flat)} values, {np.prod(shape)} are expected'
-        )
-    return flat.reshape(shape)
+    lengths = [field.lengths[n] if isinstance(n, str) else (n,) for n in field.shape]
+    shapes = {math.prod(shape): shape for shape in itertools.product(*lengths)}
+    if len(flat) not in shapes:
+        expected = ' or '.join(map(str, shapes))
+        raise DataError(f'{where}: {field.name} has {len(flat)} values, {expected} are expected')
+    return flat.reshape(shapes[len(flat)])
 
 
 # The header contains the excluded fields.

@@ -148,9 +148,9 @@ class CollocationTerms(AdjustedTerms):
             changes = refinement.propose(solution)
             if changes:
                 self._steady_renewals = 0
-                return False, self._changed(changes, coefficients)
+                return False, self._likely(self._changed(changes, coefficients), adjustment)
         self._steady_renewals = self._steady_renewals + 1 if solution.is_steady else 0
-        return solution.is_steady, coefficients
+        return solution.is_steady, self._likely(coefficients, adjustment)
 
     def _renewed(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
@@ -181,6 +181,15 @@ class CollocationTerms(AdjustedTerms):
                 terms.renew(mean[first:], variance[first:])
                 if abs(terms.size_px - before) > SETTLED_VARIATION * before:
                     self._steady_renewals = 0
+
+    def _likely(
+        self, coefficients: Sequence[NDArray[np.float64]], adjustment: Adjustment
+    ) -> tuple[NDArray[np.float64], ...]:
+        """Return coefficients of nearly the same corrections that the priors make likely."""
+        return tuple(
+            part.likely_coefficients(current, adjustment)
+            for part, current in zip(self.parts, coefficients)
+        )
 
     def _changed(
         self, changes: Changes, coefficients: Sequence[NDArray[np.float64]]

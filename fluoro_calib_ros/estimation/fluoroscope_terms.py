@@ -14,6 +14,7 @@ from scipy.linalg import block_diag
 
 from ..correction.series import Functions, Series, sd_over_image, without_absent_bands
 from ..correction.terms import CUBIC
+from ..photogrammetry.adjustment import SAME_WEIGHTS_DECREASE
 from ..photogrammetry.collinearity import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
 from .estimator import (
@@ -225,6 +226,26 @@ class FluoroscopeTerms(TermsOfFluoroscope):
         self._use(self.functions_with(modes, self.prior))
         series = self.functions.converted(before, coefficients[:end])
         return np.concatenate([series, coefficients[end:]])
+
+    def likely_coefficients(
+        self, coefficients: NDArray[np.float64], adjustment: Adjustment
+    ) -> NDArray[np.float64]:
+        """Return coefficients (p,) of nearly the same corrections that the prior makes likely.
+
+        Where an updated prior excludes a term that the series has used, the other terms follow it,
+        with orientations as they are. An adjustment that started without it would lose them.
+        """
+        prior = prior_precision(self.functions, self.prior)
+        series = coefficients[self.of_series]
+        expected = len(series) + 2 * SAME_WEIGHTS_DECREASE * len(self.rows)
+        if series @ prior @ series < expected:
+            return coefficients
+        weight = adjustment.noise.weight(adjustment.q[self.rows])
+        weighted = np.sqrt(weight)[:, None] * self.weighted(self.values, adjustment.noise.scale)
+        information = block_diag(*[weighted.T @ weighted] * 2)
+        out = coefficients.copy()
+        out[self.of_series] = np.linalg.solve(information + prior, information @ series)
+        return out
 
     def equations(
         self, network: Network, matrix: FactorizedNormalMatrix, solved: NDArray[np.float64]

@@ -34,8 +34,8 @@ from .unknowns import Parameters, discrepancies
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-12
 UNDAMPED = 1e-6  # damping that changes no covariance visibly
-# Largest decrease of F for each image point after which the last normal matrix still describes the
-# solution: a larger one changes the weights of the image points.
+# Largest decrease of F for each image point with the last normal matrix: a larger one changes the
+# weights of the image points, and outliers would keep points that are lost on the way.
 SAME_WEIGHTS_DECREASE = 0.01
 SECANTS = 10  # secants of quasi-Newton steps; 3 to 20 are usual (Nocedal and Wright, p. 177)
 TOLERANCE = 1e-8  # predicted decrease of the cost F at which an adjustment ends
@@ -297,13 +297,13 @@ class _LevenbergMarquardt:
         self._cost_of_last = np.inf  # F where it was linearised
         self._predicted = 0.0  # decrease of F by the last step that solves linearised equations
         self._may_use_again = not problem.network.relative
+        self._same_weights = SAME_WEIGHTS_DECREASE * problem.network.n_image_points
 
     @property
     def used(self) -> _Solver | None:
         """Solver of the last step, if the weights have hardly changed since."""
         decrease = self._cost_of_last - self.current.cost
-        limit = SAME_WEIGHTS_DECREASE * self._problem.network.n_image_points
-        return self._last if decrease <= limit else None
+        return self._last if decrease <= self._same_weights else None
 
     def step(self) -> None:
         """Take or refuse one step."""
@@ -345,7 +345,7 @@ class _LevenbergMarquardt:
         """
         step = self._problem.secant_step(solver, self.current, self._secants)
         # Where the secants mislead, or an exposure had almost no weight, it may be of any size.
-        if not step.predicted <= self._predicted:
+        if not step.predicted <= min(self._predicted, self._same_weights):
             return False
         trial = self._problem.after(self.current, step)
         if self._is_worse(trial):

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig
+from rigs import smooth_pincushion as simple_calibration
+from rigs import turning as with_change
 from turning_rig import CHANGE_PX, recording, turned, turning
 
 from fluoro_calib_ros.correction.angle_field import MAX_DISTANCE, AngleField, harmonics
@@ -31,6 +33,16 @@ def field(seed=0):
     grids = np.zeros((VARIANCES, SD_GRID, SD_GRID))
     grids[HARMONICS:] = np.array(pairs)[:, None, None]
     return AngleField(SIZE, ANGLES, rng.normal(0, 0.5, (HARMONICS, 2, 10)), grids), covariance
+
+
+@pytest.mark.parametrize('degree', [3, 5])
+def test_a_series_at_an_angle_has_the_change_of_any_degree(degree):
+    calibration = with_change(simple_calibration('a', (1024, 1024)), degree=degree)
+    uv = np.random.default_rng(3).uniform(100, 900, (50, 2))
+    angle = np.deg2rad(-25)
+    one = calibration.correct(uv, exact=True, angle=angle)
+    other = calibration.at_angle(angle).correct(uv, exact=True)
+    np.testing.assert_allclose(one.uv, other.uv, atol=1e-9)
 
 
 def test_harmonics_are_cosines_and_sines_of_the_angle_and_of_twice_it():

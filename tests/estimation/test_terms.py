@@ -337,7 +337,9 @@ def test_a_change_of_the_terms_continues_with_the_same_correction():
     functions = exposure_functions(terms.parts[1].uv, SIZE, terms.parts[1].interior)
     own = ExposureTerms(functions, terms.parts[1].exposure, 0.3)
     signal = Signal(0.3, 222.0)
-    given = np.arange(1.0, 1.0 + 2 * len(terms.parts[0].functions_with(4, terms.parts[0].prior)))
+    given = 1e-6 * np.arange(
+        1.0, 1.0 + 2 * len(terms.parts[0].functions_with(4, terms.parts[0].prior))
+    )
     changes = {0: Change(4, Prior(signal, np.ones(22)), coefficients=given), 1: Change(7, own=own)}
     terms._refinements = [Proposed(changes)]
     fields = [part.correction(c) for part, c in zip(terms.parts, coefficients_of(after))]
@@ -352,6 +354,23 @@ def test_a_change_of_the_terms_continues_with_the_same_correction():
     assert [part.own for part in terms.parts] == [None, own]
 
 
+def test_other_terms_follow_what_the_prior_excludes():
+    """A radial term of 1.5 px is given up: the sines take over, and the correction stays."""
+    network, before, terms = case(modes=16, exposures=8, targets=300)
+    part = terms.parts[0]
+    signal = Signal(1.0, 300.0)
+    part.prior = replace(part.prior, signal=signal)  # whose trend has no rings
+    coefficients = np.zeros(part.count)
+    radial = [len(part.functions.powers), len(part.functions) + len(part.functions.powers) + 1]
+    coefficients[radial] = 1.5
+    field = part.correction(coefficients)
+    found = part.likely_coefficients(coefficients, before)
+    assert np.abs(found[radial]).max() < 1e-3
+    change = part.correction(found) - field
+    assert np.sqrt(np.mean(change**2)) < 0.1 * np.sqrt(np.mean(field**2))
+    assert part.likely_coefficients(found, before) is found
+
+
 def test_terms_of_exposures_stay_where_the_series_is_given_anew():
     """Agreeing rejected image points may be found after terms of exposures were added."""
     network, before, terms = case(modes=5)
@@ -361,7 +380,7 @@ def test_terms_of_exposures_stay_where_the_series_is_given_anew():
     terms._start = zeros_of(terms)
     varying, after, matrix = solved(network, before, terms)
     present = coefficients_of(after)[0]
-    given = np.arange(1.0, 1.0 + 2 * len(part.functions_with(4, part.prior)))
+    given = 1e-6 * np.arange(1.0, 1.0 + 2 * len(part.functions_with(4, part.prior)))
     terms._refinements = [Proposed({0: Change(4, coefficients=given)})]
     _, (coefficients,) = terms.renew(varying, matrix, after)
     end = part.of_series.stop

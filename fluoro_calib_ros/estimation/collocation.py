@@ -148,9 +148,12 @@ class CollocationTerms(AdjustedTerms):
             changes = refinement.propose(solution)
             if changes:
                 self._steady_renewals = 0
-                return False, self._likely(self._changed(changes, coefficients), adjustment)
+                return False, self._changed(changes, adjustment)
         self._steady_renewals = self._steady_renewals + 1 if solution.is_steady else 0
-        return solution.is_steady, self._likely(coefficients, adjustment)
+        return solution.is_steady, tuple(
+            part.likely_coefficients(current, adjustment)
+            for part, current in zip(self.parts, coefficients)
+        )
 
     def _renewed(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
@@ -182,25 +185,18 @@ class CollocationTerms(AdjustedTerms):
                 if abs(terms.size_px - before) > SETTLED_VARIATION * before:
                     self._steady_renewals = 0
 
-    def _likely(
-        self, coefficients: Sequence[NDArray[np.float64]], adjustment: Adjustment
-    ) -> tuple[NDArray[np.float64], ...]:
-        """Return coefficients of nearly the same corrections that the priors make likely."""
-        return tuple(
-            part.likely_coefficients(current, adjustment)
-            for part, current in zip(self.parts, coefficients)
-        )
-
     def _changed(
-        self, changes: Changes, coefficients: Sequence[NDArray[np.float64]]
+        self, changes: Changes, adjustment: Adjustment
     ) -> tuple[NDArray[np.float64], ...]:
         """Change the terms; return the coefficients to continue with."""
         out = []
-        for part, current in zip(self.parts, coefficients):
+        for part, current in zip(self.parts, coefficients_of(adjustment)):
             change = changes.get(part.number, Change(part.functions.complete))
             part.prior = change.prior or part.prior
             new = part.use_modes(change.modes, current)
-            if change.coefficients is not None:
+            if change.coefficients is None:
+                new = part.likely_coefficients(new, adjustment)
+            else:
                 new[part.of_series] = change.coefficients
             part.own = change.own or part.own
             out.append(np.pad(new, (0, part.count - len(new))))

@@ -337,10 +337,12 @@ def test_a_change_of_the_terms_continues_with_the_same_correction():
     functions = exposure_functions(terms.parts[1].uv, SIZE, terms.parts[1].interior)
     own = ExposureTerms(functions, terms.parts[1].exposure, 0.3)
     signal = Signal(0.3, 222.0)
-    given = 1e-6 * np.arange(
-        1.0, 1.0 + 2 * len(terms.parts[0].functions_with(4, terms.parts[0].prior))
-    )
-    changes = {0: Change(4, Prior(signal, np.ones(22)), coefficients=given), 1: Change(7, own=own)}
+    given = np.arange(1.0, 1.0 + 2 * len(terms.parts[0].functions_with(4, terms.parts[0].prior)))
+    wide = Prior(Signal(3.0, 222.0), np.ones(22))
+    changes = {
+        0: Change(4, Prior(signal, np.ones(22)), coefficients=given),
+        1: Change(7, wide, own=own),
+    }
     terms._refinements = [Proposed(changes)]
     fields = [part.correction(c) for part, c in zip(terms.parts, coefficients_of(after))]
     settled, coefficients = terms.renew(varying, matrix, after)
@@ -356,7 +358,7 @@ def test_a_change_of_the_terms_continues_with_the_same_correction():
 
 def test_other_terms_follow_what_the_prior_excludes():
     """A radial term of 1.5 px is given up: the sines take over, and the correction stays."""
-    network, before, terms = case(modes=16, exposures=8, targets=300)
+    _, before, terms = case(modes=16, exposures=8, targets=300)
     part = terms.parts[0]
     signal = Signal(1.0, 300.0)
     part.prior = replace(part.prior, signal=signal)  # whose trend has no rings
@@ -380,7 +382,7 @@ def test_terms_of_exposures_stay_where_the_series_is_given_anew():
     terms._start = zeros_of(terms)
     varying, after, matrix = solved(network, before, terms)
     present = coefficients_of(after)[0]
-    given = 1e-6 * np.arange(1.0, 1.0 + 2 * len(part.functions_with(4, part.prior)))
+    given = np.arange(1.0, 1.0 + 2 * len(part.functions_with(4, part.prior)))
     terms._refinements = [Proposed({0: Change(4, coefficients=given)})]
     _, (coefficients,) = terms.renew(varying, matrix, after)
     end = part.of_series.stop

@@ -428,7 +428,7 @@ def prior_of_additional(network: Network, f: int) -> NDArray[np.float64]:
     """Return the prior precision matrix (p, p) of the additional parameters of fluoroscope f."""
     additional = network.additional[f]
     assert additional is not None
-    return additional.prior
+    return additional.precision
 
 
 def exposure_folds(exposure: NDArray[np.int64], folds: int = FOLDS) -> NDArray[np.int64]:

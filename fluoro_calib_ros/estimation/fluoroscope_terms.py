@@ -40,7 +40,7 @@ from .priors import (
     SeriesEquations,
     covariance_by_signal,
     covariance_of_series,
-    gauge_precision,
+    gauge_conditions,
     has_rings,
     most_likely_prior,
     prior_precision,
@@ -143,12 +143,22 @@ class FluoroscopeTerms(TermsOfFluoroscope):
         """Use these functions."""
         self.functions = functions
         self.values = functions(self.uv)  #: (n, m) functions at the image points
-        self.gauge = self.gauge_of(self.values)  #: (2m, 2m) precision matrix of the gauge
+        self._gauge_rows = self._gauge_conditions(self.values)
         self._last_equations: SeriesEquations | None = None  # with these functions
+
+    @property
+    def gauge(self) -> NDArray[np.float64]:
+        """Precision matrix (2m, 2m) of the gauge."""
+        return self._gauge_rows.T @ self._gauge_rows
 
     def gauge_of(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the precision matrix (2m, 2m) of the gauge for values (n, m) of functions."""
-        return gauge_precision(values, self.uv, self.interior, self.gauge_kind)
+        rows = self._gauge_conditions(values)
+        return rows.T @ rows
+
+    def _gauge_conditions(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the rows (g, 2m) that fix the gauge for values (n, m) of functions."""
+        return gauge_conditions(values, self.uv, self.interior, self.gauge_kind)
 
     def use_interior(self, estimated: NDArray[np.float64]) -> None:
         """Update the gauge to an estimated interior orientation (3,).
@@ -176,7 +186,7 @@ class FluoroscopeTerms(TermsOfFluoroscope):
         if self.place_searches and self.prior.local is not None:
             self.place_searches -= 1
             self.prior = with_more_places(equations, self.prior)
-        self.gauge = self.gauge_of(self.values)
+        self._gauge_rows = self._gauge_conditions(self.values)
         return not self.functions.modes or self.prior.change(last, self.functions) < SETTLED_PRIOR
 
     @property
@@ -191,11 +201,13 @@ class FluoroscopeTerms(TermsOfFluoroscope):
 
     def additional(self) -> AdditionalParameters:
         """Return the additional parameters: the series, then the terms of the exposures."""
-        prior = prior_precision(self.functions, self.prior) + self.gauge
+        prior = prior_precision(self.functions, self.prior)
+        rows = self._gauge_rows
         if self.own is None:
-            return AdditionalParameters(self.values, prior)
+            return AdditionalParameters(self.values, prior, conditions=rows)
         prior = block_diag(prior, np.diag(self.own.precision))
-        return AdditionalParameters(self.values, prior, self.own.functions)
+        rows = np.pad(rows, ((0, 0), (0, self.own.count)))
+        return AdditionalParameters(self.values, prior, self.own.functions, rows)
 
     def correction(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the corrections (n, 2) [px] of the image points by the series."""

@@ -27,10 +27,10 @@ from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_
 from .parametric import covariance_with_uncertain_terms
 from .signal import Signal, SignalEquations, most_likely_signal, plausible_signals, starting_signal
 
-# Standard deviation that fixes the gauge. With ten times as much it would show in the standard
-# deviation of a correction (0.005 px where they are best). With a tenth, its large weights damp
-# the steps of the adjustment, and rounding of F exceeds the tolerance (31,000 image points: 5e-4).
-GAUGE_SD_PX = 3e-4
+# Standard deviation that fixes the gauge. With three times as much it shows in the standard
+# deviation of a correction (5 % of the best, 0.005 px); with a third it damps the steps of the
+# adjustment.
+GAUGE_SD_PX = 1e-4
 # Prior variance of a non-existing trend term, relative to the variance of its estimate.
 MIN_RELATIVE_VARIANCE = 1e-3
 MAX_VARIANCE = 1e8  # largest prior variance of a trend term
@@ -199,19 +199,18 @@ def _posterior(
     return covariance @ equations.right, covariance
 
 
-def gauge_precision(
+def gauge_conditions(
     values: NDArray[np.float64],
     uv: NDArray[np.float64],
     interior: NDArray[np.float64],
     kind: GaugeKind = GaugeKind.FULL,
 ) -> NDArray[np.float64]:
-    """Return the precision matrix that keeps a series orthogonal to the gauge at image points.
+    """Return rows (g, 2m) that keep a series orthogonal to the gauge at image points.
 
     values: (n, m) functions of the series at the image points. uv: (n, 2) image points [px].
-    interior: (3,) xp, yp, c [px]. Returns (2m, 2m).
+    interior: (3,) xp, yp, c [px]. The products with coefficients have the standard deviation one.
     """
-    rows = gauge_rows(values, uv, interior, kind)
-    return rows.T @ rows / GAUGE_SD_PX**2
+    return gauge_rows(values, uv, interior, kind) / GAUGE_SD_PX
 
 
 def most_likely_prior(equations: SeriesEquations, prior: Prior) -> Prior:

@@ -202,9 +202,13 @@ def exposure_terms(solution: Solution) -> Changes:
             continue
         higher = variation(points.residuals, points.exposure, functions, TERMS)
         degree = QUINTIC if higher.chi2_per_dof > MORE_THAN_NOISE else CUBIC
-        kind = GaugeKind.TREND if part.gauge_kind is GaugeKind.TREND else GaugeKind.FULL
+        is_flat = part.gauge_kind is GaugeKind.TREND  # and shows no change of the interior
         functions = exposure_functions(
-            part.uv, *gauge, with_interior=can_be_fitted(part.angles), kind=kind, degree=degree
+            part.uv,
+            *gauge,
+            with_interior=can_be_fitted(part.angles) and not is_flat,
+            kind=GaugeKind.TREND if is_flat else GaugeKind.FULL,
+            degree=degree,
         )
         own = ExposureTerms(functions, part.exposure, cubic.size_px, degree)
         out[part.number] = Change(modes, own=own)

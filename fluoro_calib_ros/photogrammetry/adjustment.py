@@ -90,8 +90,7 @@ def total_cost(
     square = 0.0
     for f, additional in enumerate(network.additional):
         if additional is not None:
-            coefficients = parameters.additional_of(f)
-            square += float(coefficients @ additional.prior @ coefficients)
+            square += additional.penalty(parameters.additional_of(f))
     if network.datum == 'survey':
         survey_residuals = parameters.points_mm - network.survey_mm
         square += float(np.sum((survey_residuals / network.survey_sd_mm[:, None]) ** 2))

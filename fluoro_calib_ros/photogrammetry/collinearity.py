@@ -149,6 +149,30 @@ class AdditionalParameters:
     prior: NDArray[np.float64]  #: (P, P) precision matrix of the coefficients; zeros for no prior
     #: with functions (N, k): functions of groups of image points, whose coefficients are the last
     grouped: GroupedFunctions | None = None
+    #: (g, P) rows whose products with the coefficients have zero mean and unit variance too. Rows
+    #: that fix a gauge have large products with parts of the coefficients, which cancel out only
+    #: as long as they are not squared.
+    conditions: NDArray[np.float64] | None = None
+
+    @cached_property
+    def precision(self) -> NDArray[np.float64]:
+        """Precision matrix (P, P) of the prior with its conditions."""
+        rows = self.conditions
+        return self.prior if rows is None else self.prior + rows.T @ rows
+
+    def pull(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivatives (P,) of half the penalty of coefficients (P,)."""
+        out = self.prior @ coefficients
+        if self.conditions is not None:
+            out += self.conditions.T @ (self.conditions @ coefficients)
+        return out
+
+    def penalty(self, coefficients: NDArray[np.float64]) -> float:
+        """Return the normalised square of coefficients (P,) by the prior."""
+        square = float(coefficients @ self.prior @ coefficients)
+        if self.conditions is not None:
+            square += float(np.sum((self.conditions @ coefficients) ** 2))
+        return square
 
     @property
     def _common(self) -> int:

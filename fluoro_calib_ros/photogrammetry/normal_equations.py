@@ -353,7 +353,7 @@ def right_sides(
         global_right[layout.all_interiors] += _interior_pull(network, parameters)
     for f, (additional, columns) in enumerate(zip(network.additional, layout.additional)):
         if additional is not None:
-            pull = additional.prior @ parameters.additional_of(f)
+            pull = additional.pull(parameters.additional_of(f))
             global_right[columns] = additional.right_side(weighted[network.rows(f)]) - pull
     return UnknownVector(exteriors, points.T + _survey_pull(network, parameters), global_right)
 
@@ -485,6 +485,8 @@ def _add_additional(
         interior = layout.interiors[f]
         blocks.gg[interior, columns] = mixed
         blocks.gg[columns, interior] = mixed.T
-        blocks.gg[columns, columns] = additional.normal_matrix(root[rows] ** 2) + additional.prior
-        prior_pull = additional.prior @ parameters.additional_of(f)
-        blocks.g[columns] = additional.right_side(w[:, 0] * r[rows]) - prior_pull
+        blocks.gg[columns, columns] = (
+            additional.normal_matrix(root[rows] ** 2) + additional.precision
+        )
+        pull = additional.pull(parameters.additional_of(f))
+        blocks.g[columns] = additional.right_side(w[:, 0] * r[rows]) - pull

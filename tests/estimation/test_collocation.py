@@ -51,7 +51,7 @@ from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.priors import (
     Prior,
     SeriesEquations,
-    gauge_precision,
+    gauge_conditions,
     has_rings,
     most_likely_prior,
     starting_prior,
@@ -190,7 +190,8 @@ def test_rings_exist_where_the_distortion_has_them(amplitude):
     information = np.kron(np.eye(2), values.T @ values / 0.25**2)
     right = (values.T @ observed / 0.25**2).T.ravel()
     prior = starting_prior(functions, 1.0)
-    gauge = gauge_precision(values, uv, np.array([511.5, 511.5, 4000.0]))
+    rows = gauge_conditions(values, uv, np.array([511.5, 511.5, 4000.0]))
+    gauge = rows.T @ rows
     for _ in range(4):
         prior = most_likely_prior(SeriesEquations(functions, information, right, gauge), prior)
     assert has_rings(functions, prior) == (amplitude > 0)
@@ -343,7 +344,8 @@ def test_prior_of_a_signal_is_estimated():
         information, right = drawn_field(
             functions, Prior(Signal(0.5, 220.0), there), seed, uv, 0.25
         )
-        gauge = gauge_precision(functions(uv), uv, np.array([511.5, 511.5, 4000.0]))
+        rows = gauge_conditions(functions(uv), uv, np.array([511.5, 511.5, 4000.0]))
+        gauge = rows.T @ rows
         for _ in range(4):
             prior = most_likely_prior(SeriesEquations(functions, information, right, gauge), prior)
         found.append(prior)

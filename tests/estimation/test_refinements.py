@@ -97,12 +97,12 @@ def test_places_are_searched_only_next_to_others_and_a_few_times(
         prior=given,
         place_searches=left,
         values=None,
-        gauge_of=lambda values: 'gauge',
+        _gauge_conditions=lambda values: 'gauge',
         functions=SimpleNamespace(modes=4),
     )
     assert fluoroscope_terms.FluoroscopeTerms.renew_prior(part, 'equations')
     assert len(tried) == searched and part.place_searches == left - searched
-    assert part.prior is given and part.gauge == 'gauge'
+    assert part.prior is given and part._gauge_rows == 'gauge'
 
 
 @pytest.mark.parametrize('change, terms', [(None, 0), (2, 14), (4, 36)])

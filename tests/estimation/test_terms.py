@@ -176,7 +176,7 @@ def test_equations_have_the_part_of_the_weights_that_is_information():
     np.testing.assert_allclose(reduced.information, 0.8 * plain.information)
     ones = np.ones(part.count)
     right = part.equations(varying, matrix, ones).right
-    prior = varying.additional[0].prior
+    prior = varying.additional[0].precision
     np.testing.assert_allclose(right, (plain.information + prior) @ ones, rtol=1e-6)
 
 

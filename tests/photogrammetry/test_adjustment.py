@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.initial_network import adjusted_with_precision
-from fluoro_calib_ros.estimation.priors import gauge_precision
+from fluoro_calib_ros.estimation.priors import gauge_conditions
 from fluoro_calib_ros.photogrammetry import adjustment
 from fluoro_calib_ros.photogrammetry.adjustment import (
     _Secants,
@@ -458,8 +458,12 @@ def test_start_off_the_gauge_gives_the_same_solution(seed):
     uv[false] += rng.normal(0, 25, (int(false.sum()), 2))
     values = Functions((1024, 1024), 3)(uv)
     count = 2 * values.shape[1]
-    prior = 1e-2 * np.eye(count) + gauge_precision(values, uv, truth.interior[0])
-    network = replace(network, uv=uv, additional=(AdditionalParameters(values, prior),))
+    rows = gauge_conditions(values, uv, truth.interior[0])
+    network = replace(
+        network,
+        uv=uv,
+        additional=(AdditionalParameters(values, 1e-2 * np.eye(count), None, rows),),
+    )
     start = replace(
         rigs.disturbed(truth, degrees=0.3, mm=3.0), additional=(rng.normal(0, 1, count),)
     )

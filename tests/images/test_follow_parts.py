@@ -591,7 +591,7 @@ def test_outliers_of_responses_do_not_decide_between_poses():
     rng = np.random.default_rng(5)
     size = np.where(np.arange(64) < 3, 0.4, 0.0)
     decided = []
-    for _ in range(60):
+    for _ in range(40):
         uv = rng.uniform(100, 900, (64, 2))
         outlier = np.where(rng.random(64) < 0.15, rng.uniform(-1.5, 1.5, 64), 0)
         response = 2 * size + rng.normal(0, 0.1, 64) + outlier
@@ -609,14 +609,14 @@ def test_sizes_tell_the_pose_where_most_responses_of_one_half_are_outliers():
     rng = np.random.default_rng(5)
     size = np.where(np.arange(64) < 12, 0.4, 0.0)
     leads = []
-    for _ in range(25):
+    for _ in range(15):
         uv = rng.uniform(100, 900, (64, 2))
         covered = (uv[:, 0] < 500) & (rng.random(64) < 0.6)
         response = 2 * size + rng.normal(0, 0.1, 64) + covered * rng.uniform(-1.5, 1.5, 64)
         sizes = [size, *(rng.permutation(size) for _ in range(23))]
         likelihoods = [matching._likelihood_of_sizes(one, response, uv) for one in sizes]
         leads.append(likelihoods[0] - max(likelihoods[1:]))
-    assert np.count_nonzero(np.array(leads) > matching.LIKELIER) >= 23
+    assert np.count_nonzero(np.array(leads) > matching.LIKELIER) >= 14
 
 
 def bodies_that_learn(monkeypatch, known):

@@ -3,12 +3,16 @@
 
 """Signals end a command, whatever it is doing at that moment."""
 
+import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+
+from fluoro_calib_ros.cli import output
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,47 +35,6 @@ with output.terminated_by_signals():
     print('goes on', flush=True)
     while True:
         pass
-"""
-
-LOSES_IT_AGAIN = """
-import os
-import signal
-from fluoro_calib_ros.cli import output
-output.AGAIN_S = 0.05
-
-class Loses:
-    def __del__(self):
-        while True:  # the handler runs here, and Python drops what it raises
-            pass
-
-class Sender(Loses):
-    def __del__(self):
-        os.kill(os.getpid(), signal.SIGTERM)
-        super().__del__()
-
-with output.terminated_by_signals():
-    for kind in (Sender, Loses, Loses):
-        loses = kind()
-        del loses
-        print('goes on', flush=True)
-    while True:
-        pass
-"""
-
-ENDS_AT_LEISURE = """
-import os
-import signal
-import time
-from fluoro_calib_ros.cli import output
-output.AGAIN_S = 0.05
-
-try:
-    with output.terminated_by_signals():
-        os.kill(os.getpid(), signal.SIGTERM)
-        signal.pause()
-except SystemExit as error:
-    time.sleep(0.3)
-    print('ends with', error.code, flush=True)
 """
 
 CLEANS_UP = """
@@ -116,12 +79,19 @@ def test_what_cleans_up_is_not_interrupted():
     assert done.stdout == 'cleaned up\n'
 
 
-def test_exception_that_python_drops_again_and_again_is_raised_until_it_ends_the_command():
-    done = run(LOSES_IT_AGAIN)
-    assert done.returncode == 143, done.stderr
-    assert done.stdout == 'goes on\n' * 3
-
-
-def test_no_signal_follows_a_command_that_has_ended():
-    done = run(ENDS_AT_LEISURE)
-    assert (done.returncode, done.stdout) == (0, 'ends with 143\n'), done.stderr
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT])
+def test_exception_that_is_lost_is_raised_again_and_again_until_the_command_has_ended(
+    number, monkeypatch
+):
+    monkeypatch.setattr(output, 'AGAIN_S', 0.02)
+    lost = []
+    with output.terminated_by_signals():
+        while len(lost) < 3:
+            try:
+                if not lost:
+                    os.kill(os.getpid(), number)
+                time.sleep(60)
+            except (SystemExit, KeyboardInterrupt) as error:
+                lost.append(error)
+    assert set(map(type, lost)) == {SystemExit if number == signal.SIGTERM else KeyboardInterrupt}
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

@@ -612,11 +612,23 @@ def test_sizes_tell_the_pose_where_most_responses_of_one_half_are_outliers():
     for _ in range(15):
         uv = rng.uniform(100, 900, (64, 2))
         covered = (uv[:, 0] < 500) & (rng.random(64) < 0.6)
-        response = 2 * size + rng.normal(0, 0.1, 64) + covered * rng.uniform(-1.5, 1.5, 64)
+        response = 4 + uv[:, 1] / 4000 + 2 * size + rng.normal(0, 0.1, 64)
+        response += covered * rng.uniform(-1.5, 1.5, 64)
         sizes = [size, *(rng.permutation(size) for _ in range(23))]
         likelihoods = [matching._likelihood_of_sizes(one, response, uv) for one in sizes]
         leads.append(likelihoods[0] - max(likelihoods[1:]))
     assert np.count_nonzero(np.array(leads) > matching.LIKELIER) >= 14
+
+
+def test_one_bead_without_a_response_hardly_matters():
+    """No other bead is an outlier: the probability of one is not taken for zero."""
+    rng = np.random.default_rng(9)
+    size = np.where(np.arange(64) < 12, 0.4, 0.0)
+    uv = rng.uniform(100, 900, (64, 2))
+    response = 4 + 2 * size + rng.uniform(-0.1, 0.1, 64)
+    with_all = matching._likelihood_of_sizes(size, response, uv)
+    response[40] = np.log(1e-3)
+    assert 5 < with_all - matching._likelihood_of_sizes(size, response, uv) < 20
 
 
 def bodies_that_learn(monkeypatch, known):

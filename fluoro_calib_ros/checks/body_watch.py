@@ -38,7 +38,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
 from ..rows import chosen_rows, joined_rows
-from .drift_charts import DriftOptions, ImageAreas
+from .drift_charts import Block, DriftOptions, ImageAreas
 
 COMPONENTS = 2  # components of a shift in an image, u and v
 # Fraction of the systematic standard deviation that markers in an area have in common. Measured
@@ -52,19 +52,16 @@ MAX_LEARNING = 5000  # exposures that are stored until all markers are known
 
 
 @dataclass(frozen=True)
-class BodyBlock:
-    """Statistics of the bodies in a block.
+class BodyBlock(Block):
+    """Statistics of all bodies together in a block.
 
-    The 2F series are the drifts along u and v in the F fluoroscopes.
+    The 2F series are the drifts along u and v in the F fluoroscopes. An area is tested if enough
+    marker pairs are on both sides of its border.
     """
 
-    #: (B, 2F, A) score and information of a drift of each area, by body [1/px, 1/px^2]
-    score: NDArray[np.float64]
-    information: NDArray[np.float64]
-    #: (2F, A) systematic standard deviations of the drift from all bodies together [px]
-    systematic: NDArray[np.float64]
-    #: (2F, A) whether enough marker pairs are on both sides of the border of the area
-    enough: NDArray[np.bool_]
+    #: (B, 2F, A) score and information of each body
+    score_of_body: NDArray[np.float64]
+    information_of_body: NDArray[np.float64]
     count: int  #: number of marker places
 
 
@@ -197,8 +194,17 @@ class BodyWatch:
         rows = np.flatnonzero(np.count_nonzero(has_marker, axis=1) > 1)
         shape = (COMPONENTS * len(self._sizes), len(self._areas))
         if not len(rows):
-            zeros = np.zeros((len(self.bodies), *shape))
-            return BodyBlock(zeros, zeros, np.zeros(shape), np.zeros(shape, bool), 0)
+            none = np.zeros(shape)
+            of_body = np.zeros((len(self.bodies), *shape))
+            return BodyBlock(
+                none,
+                none,
+                none,
+                none.astype(bool),
+                score_of_body=of_body,
+                information_of_body=of_body,
+                count=0,
+            )
         body = rows % len(self.bodies)
         has_marker = has_marker[rows]
         points = chosen_rows(seen.points, rows)
@@ -212,18 +218,21 @@ class BodyWatch:
         score, information, amplitude = np.zeros((3, len(self.bodies), *shape))
         for total, values in zip((score, information, amplitude), statistics):
             np.add.at(total, body, values)
+        total_information = information.sum(axis=0)
         with np.errstate(divide='ignore', invalid='ignore'):
-            systematic = amplitude.sum(axis=0) / information.sum(axis=0)
+            systematic = amplitude.sum(axis=0) / total_information
         markers_inside = inside.sum(axis=2)
         pairs = (markers_inside * (has_marker.sum(axis=1)[:, None, None] - markers_inside)).sum(
             axis=0
         )
         return BodyBlock(
-            score,
-            information,
+            score.sum(axis=0),
+            total_information,
             COMMON_SYSTEMATIC * systematic,
             np.repeat(pairs > MIN_PAIRS * exposures, COMPONENTS, axis=0),
-            int(has_marker.sum()),
+            score_of_body=score,
+            information_of_body=information,
+            count=int(has_marker.sum()),
         )
 
     def _inside(self, points: ImagePoints) -> NDArray[np.float64]:

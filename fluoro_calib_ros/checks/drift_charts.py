@@ -226,6 +226,17 @@ class EpipolarObservations(EpipolarResiduals):
         return chosen_rows(self, is_usable)
 
 
+@dataclass(frozen=True)
+class Block:
+    """Statistics of the observations of a block, in K series and A areas."""
+
+    #: (K, A) score and information of a drift of each area [1/px, 1/px^2]
+    score: NDArray[np.float64]
+    information: NDArray[np.float64]
+    systematic: NDArray[np.float64]  #: (K, A) systematic standard deviations of the drift [px]
+    enough: NDArray[np.bool_]  #: (K, A) whether the area has enough observations to be tested
+
+
 # Areas of an image in which the drift watch tests for a drift.
 
 

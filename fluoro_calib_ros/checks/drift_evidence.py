@@ -14,14 +14,15 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..photogrammetry.noise import SURE
-from .body_watch import COMPONENTS
-from .drift_charts import MIN_INFORMATION, CusumCharts
+from .body_watch import COMPONENTS, BodyBlock
+from .drift_charts import MIN_INFORMATION, Block, CusumCharts
+from .pair_watch import PairBlock
 
 WINDOW_S = 30.0  # newest blocks from which place and size of a drift are estimated
 # Minimum ratio of the log-likelihoods of another and the likeliest fluoroscope to name both.
@@ -31,18 +32,7 @@ EPIPOLAR = 'epipolar'  # source of a drift shown by residuals
 SERIES_OF_PAIR = 4  # images a and b against the calibration, then against the start
 
 
-@dataclass(frozen=True)
-class BlockRecord:
-    """Block: start time, and statistics (K, A) of the series.
-
-    detail: normals (pairs, 2, A, 2) of the epipolar lines, or a BodyBlock.
-    """
-
-    begin_ns: int
-    score: np.ndarray
-    information: np.ndarray
-    systematic: NDArray[np.float64]
-    detail: Any
+B = TypeVar('B', bound=Block)
 
 
 @dataclass(frozen=True)
@@ -70,7 +60,7 @@ class _Candidate:
     area: int
 
 
-class Evidence(ABC):
+class Evidence(ABC, Generic[B]):
     """Charts of one kind of observations, and the newest blocks.
 
     window: number of blocks from which a drift is estimated.
@@ -79,18 +69,17 @@ class Evidence(ABC):
     def __init__(self, charts: CusumCharts, fluoroscopes: Sequence[str], window: int) -> None:
         self.charts = charts
         self._names = tuple(fluoroscopes)
-        self._records: deque[BlockRecord] = deque(maxlen=window)
+        self._records: deque[tuple[int, B]] = deque(maxlen=window)  # start [ns] and block
 
     @property
     def peak(self) -> float:
         """Largest evidence of all charts."""
         return float(self.charts.evidence.max())
 
-    def update(self, record: BlockRecord, band: np.ndarray, testing: np.ndarray) -> None:
-        """Add a block; band and testing (K, A) are as in CusumCharts.update."""
-        charts = self.charts
-        charts.update(record.score, record.information, band, testing, record.begin_ns)
-        self._records.append(record)
+    def update(self, begin_ns: int, block: B, band: np.ndarray, testing: np.ndarray) -> None:
+        """Add a block and its start; band and testing (K, A) are as in CusumCharts.update."""
+        self.charts.update(block.score, block.information, band, testing, begin_ns)
+        self._records.append((begin_ns, block))
 
     def estimate(self, min_evidence: float) -> DriftEstimate:
         """Return the most likely drift among the charts with at least this evidence."""
@@ -100,15 +89,15 @@ class Evidence(ABC):
         peak = np.unravel_index(np.argmax(likelihood), likelihood.shape)
         chart = int(peak[1])
         begin, run = self._run(chart, int(peak[2]), int(charts.begin[peak]))
-        score = np.asarray(sum(record.score for record in run))
-        information = np.asarray(sum(record.information for record in run))
+        score = np.sum([block.score for block in run], axis=0)
+        information = np.sum([block.information for block in run], axis=0)
         factor = float(np.median(charts.variance_factor()[chart]))
         with np.errstate(divide='ignore', invalid='ignore'):
             size = score / information
         likelihood = np.nan_to_num(score * size / (2 * factor))
         names, series, area = self._likeliest(likelihood, chart)
         systematic = np.nansum(
-            [r.systematic[series, area] * r.information[series, area] for r in run]
+            [b.systematic[series, area] * b.information[series, area] for b in run]
         )
         total = information[series, area]
         direction, against, source, confirmed = self._described(run, series, area)
@@ -124,20 +113,20 @@ class Evidence(ABC):
             begin_ns=begin,
         )
 
-    def _run(self, series: int, area: int, begin_ns: int) -> tuple[int, list[BlockRecord]]:
+    def _run(self, series: int, area: int, begin_ns: int) -> tuple[int, list[B]]:
         """Return the start of a drift [ns] and the blocks since then, those of largest likelihood.
 
         If the drift is older than the window, its start is at most begin_ns, that of the run.
         """
-        records = list(self._records)
+        begins_ns, blocks = zip(*self._records)
         sums = np.cumsum(
-            [[r.score[series, area], r.information[series, area]] for r in reversed(records)],
+            [[b.score[series, area], b.information[series, area]] for b in reversed(blocks)],
             axis=0,
         )
         likelihood = sums[:, 0] ** 2 / np.maximum(sums[:, 1], MIN_INFORMATION)
-        first = len(records) - 1 - int(np.argmax(likelihood))
-        begin = records[first].begin_ns
-        return (min(begin_ns, begin) if first == 0 else begin), records[first:]
+        first = len(blocks) - 1 - int(np.argmax(likelihood))
+        begin = begins_ns[first]
+        return (min(begin_ns, begin) if first == 0 else begin), list(blocks[first:])
 
     def _ranked(self, candidates: dict[str, _Candidate]) -> tuple[tuple[str, ...], int, int]:
         """Return names of the likeliest fluoroscopes, and series and area of the first of them."""
@@ -162,13 +151,13 @@ class Evidence(ABC):
 
     @abstractmethod
     def _described(
-        self, run: list[BlockRecord], series: int, area: int
+        self, run: list[B], series: int, area: int
     ) -> tuple[NDArray[np.float64], str, str, bool]:
         """Return direction (2,) of a drift, one of REFERENCES, source, and whether confirmed."""
 
 
-class EpipolarEvidence(Evidence):
-    """Evidence from epipolar residuals: for each pair of views the four series of a PairBlock."""
+class EpipolarEvidence(Evidence[PairBlock]):
+    """Evidence from epipolar residuals: the rows of the PairBlocks of all pairs of views."""
 
     def __init__(self, charts: CusumCharts, fluoroscopes: Sequence[str], window: int) -> None:
         super().__init__(charts, fluoroscopes, window)
@@ -199,15 +188,15 @@ class EpipolarEvidence(Evidence):
         return self._ranked(candidates)
 
     def _described(
-        self, run: list[BlockRecord], series: int, area: int
+        self, run: list[PairBlock], series: int, area: int
     ) -> tuple[NDArray[np.float64], str, str, bool]:
         pair, of_pair = divmod(series, SERIES_OF_PAIR)
-        normal = sum(record.detail[pair, series % 2, area] for record in run)
+        normal = np.sum([block.normals[2 * pair + series % 2, area] for block in run], axis=0)
         direction = normal / max(np.linalg.norm(normal), MIN_INFORMATION)
         return direction, REFERENCES[of_pair // 2], EPIPOLAR, True
 
 
-class BodyEvidence(Evidence):
+class BodyEvidence(Evidence[BodyBlock]):
     """Evidence from rigid bodies: the series are drifts along u and v in each view.
 
     bodies: names, in the order of the BodyBlocks.
@@ -236,10 +225,10 @@ class BodyEvidence(Evidence):
         return self._ranked(candidates)
 
     def _described(
-        self, run: list[BlockRecord], series: int, area: int
+        self, run: list[BodyBlock], series: int, area: int
     ) -> tuple[NDArray[np.float64], str, str, bool]:
-        score = sum(record.detail.score[:, series, area] for record in run)
-        information = sum(record.detail.information[:, series, area] for record in run)
+        score = np.sum([block.score_of_body[:, series, area] for block in run], axis=0)
+        information = np.sum([block.information_of_body[:, series, area] for block in run], axis=0)
         sign = np.sign(score.sum())
         significance = sign * score / np.sqrt(np.maximum(information, MIN_INFORMATION))
         strongest = int(np.argmax(significance))

@@ -54,7 +54,6 @@ from .drift_evidence import (
     EPIPOLAR,
     SERIES_OF_PAIR,
     WINDOW_S,
-    BlockRecord,
     BodyEvidence,
     DriftEstimate,
     EpipolarEvidence,
@@ -197,8 +196,6 @@ class DriftWatch:
         if not seen:
             return False
         block = joined_rows(blocks)
-        normals = np.stack([pair_block.normals for pair_block in blocks])
-        record = BlockRecord(begin_ns, block.score, block.information, block.systematic, normals)
         learned = [self._has_learned(count) for count in self._learned_blocks]
         testing = block.enough & np.repeat(learned, SERIES_OF_PAIR)[:, None]
         stretch = np.array([watch.stretch() for watch in self._watches])
@@ -206,7 +203,7 @@ class DriftWatch:
         self._bodies.charts.stretch[:] = stretch.max()
         bands = np.repeat([options.band_calibration, options.band_start], 2)
         bands = np.tile(bands, len(self._pairs))[:, None]
-        self._epipolar.update(record, self._dead_band(bands, record.systematic), testing)
+        self._epipolar.update(begin_ns, block, self._dead_band(bands, block.systematic), testing)
         for number in seen:
             self._learn(number)
         return bool(testing.any())
@@ -219,11 +216,8 @@ class DriftWatch:
             return False
         self._observations += block.count
         testing = block.enough & self._has_learned(self._learned_body_blocks)
-        score = block.score.sum(axis=0)
-        information = block.information.sum(axis=0)
-        record = BlockRecord(begin_ns, score, information, block.systematic, block)
-        band = self._dead_band(self.options.band_start, record.systematic)
-        self._bodies.update(record, band, testing)
+        band = self._dead_band(self.options.band_start, block.systematic)
+        self._bodies.update(begin_ns, block, band, testing)
         self._learned_body_blocks += 1
         if self._has_learned(self._learned_body_blocks):
             watch.learn()
@@ -258,7 +252,8 @@ class DriftWatch:
     def _present_state(self) -> DriftState:
         """Return the state according to the present charts."""
         warn, error = self.thresholds
-        strongest = max((self._epipolar, self._bodies), key=lambda evidence: evidence.peak)
+        is_epipolar = self._epipolar.peak >= self._bodies.peak
+        strongest = self._epipolar if is_epipolar else self._bodies
         peak = strongest.peak
         level: Severity = OK
         if peak >= error:

@@ -132,10 +132,8 @@ def _factor_by_samples(
         try:
             with np.errstate(all='ignore'):
                 candidates = direct_linear_transformation(
-                    versions[choice, samples],
-                    frame.uv[samples],
-                    least=least_vectors_with_last_one,
-                )
+                    versions[choice, samples], frame.uv[samples], least_vectors_with_last_one
+                )(None)
                 squared = [
                     squared_residuals(candidates, version, frame.uv) for version in versions
                 ]

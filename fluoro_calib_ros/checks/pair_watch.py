@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .drift_charts import MEMORY, DriftOptions, EpipolarObservations, ImageAreas
+from .drift_charts import MEMORY, Block, DriftOptions, EpipolarObservations, ImageAreas
 
 LAGS = (1, 2, 4)  # frame lags at which the noise of a marker is compared
 MAX_CORRELATION = 0.97  # maximum for the noise of a marker in successive frames
@@ -19,18 +19,13 @@ NUGGET = 0.35  # fraction of the systematic standard deviation that the nodes ca
 
 
 @dataclass(frozen=True)
-class PairBlock:
+class PairBlock(Block):
     """Statistics of a block of epipolar residuals.
 
     The four series are: image a and image b against the calibration, then image a and image b
     against the start.
     """
 
-    #: (4, A) score and information of a drift of each area [1/px, 1/px^2]
-    score: NDArray[np.float64]
-    information: NDArray[np.float64]
-    systematic: NDArray[np.float64]  #: (4, A) systematic standard deviations [px]
-    enough: NDArray[np.bool_]  #: (4, A) whether there are enough markers in the area
     #: (2, A, 2) sums of the normals of the epipolar lines in both images
     normals: NDArray[np.float64]
 

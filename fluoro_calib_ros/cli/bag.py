@@ -125,21 +125,22 @@ def _info(arguments: argparse.Namespace) -> None:
 def _record(arguments: argparse.Namespace) -> None:
     from ..io.bags.recording import RecordingOptions
 
-    parameters = dataclasses.asdict(options_of(RecordingOptions, arguments))
-    parameters['folder'] = str(arguments.out.absolute())
-    if arguments.topics:
-        parameters['topics'] = arguments.topics
-    become_node('recorder_node', parameters)
+    _become('recorder_node', RecordingOptions, arguments, folder=arguments.out)
 
 
 def _play(arguments: argparse.Namespace) -> None:
     from ..io.bags.recording import PlayingOptions
 
-    parameters = dataclasses.asdict(options_of(PlayingOptions, arguments))
-    parameters['bag'] = str(arguments.source.absolute())
+    _become('player_node', PlayingOptions, arguments, bag=arguments.source)
+
+
+def _become(node: str, options: type, arguments: argparse.Namespace, **paths: Path) -> NoReturn:
+    """Replace this process by a node with these options of the command, topics and paths."""
+    parameters = dataclasses.asdict(options_of(options, arguments))
+    parameters |= {name: str(path.absolute()) for name, path in paths.items()}
     if arguments.topics:
         parameters['topics'] = arguments.topics
-    become_node('player_node', parameters)
+    become_node(node, parameters)
 
 
 def become_node(node: str, parameters: Mapping[str, Any]) -> NoReturn:

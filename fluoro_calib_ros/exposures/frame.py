@@ -199,13 +199,15 @@ def length_error(target_id: Sized, **arrays: Sized) -> str:
     return ''
 
 
-def image_size_error(image_size: tuple[int, int], expected: tuple[int, int]) -> str:
-    """Return the error of an image size (width, height) that differs from the calibration's."""
+def image_size_error(
+    image_size: tuple[int, int], expected: tuple[int, int], of: str = 'the calibration is for'
+) -> str:
+    """Return the error of an image size (width, height) that differs from an expected one."""
     if tuple(image_size) == tuple(expected):
         return ''
     return (
         f'the image is {image_size[0]} x {image_size[1]} px, '
-        f'but the calibration is for {expected[0]} x {expected[1]} px'
+        f'but {of} {expected[0]} x {expected[1]} px'
     )
 
 

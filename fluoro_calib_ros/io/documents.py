@@ -92,7 +92,7 @@ def read_yaml(path: PathLike) -> Any:
 
 def parse_yaml(text: str, where: object) -> Any:
     """Parse a YAML text. Raises DataError whose message begins with where."""
-    check_budget('YAML', text, where)
+    check_yaml(text, where)
     if _CHAIN.search(text):
         _fail_nested('YAML', where)
     return _parsed('YAML', where, lambda: yaml.load(text, Loader=_Loader))  # a safe loader
@@ -124,10 +124,10 @@ def parse_xml(text: str, where: object) -> ElementTree.Element:
     return _parsed('XML', where, lambda: ElementTree.fromstring(text))
 
 
-def check_budget(kind: str, text: str, where: object) -> None:
-    """Raise DataError if a text is too large for its format, or nested too deeply."""
-    _check_size(kind, text, where)
-    _check_depth(kind, text, where)
+def check_yaml(text: str, where: object) -> None:
+    """Raise DataError if a YAML text is too large, or nested too deeply."""
+    _check_size('YAML', text, where)
+    _check_depth('YAML', text, where)
 
 
 def _check_size(kind: str, text: str, where: object) -> None:

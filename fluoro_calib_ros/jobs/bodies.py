@@ -570,15 +570,11 @@ def _impossible(motion: JointMotion) -> Finding | None:
     degrees = np.rad2deg(np.quantile(motion.angles[known], (FEW, 1 - FEW), axis=0).T)
     for name, (least, most), (low, high) in zip(of.angles, degrees, of.limits_deg):
         if least < low or most > high:
-            return Finding(
-                Kind.JOINT_IMPOSSIBLE,
+            cause = (
                 f'{name} is {least:.0f} to {most:.0f} degrees, which no joint reaches (limits '
-                f'{low:.0f} and {high:.0f})',
-                place=Place(name=f'joint {joint.name}'),
-                advice='check the side, which body is proximal, and the landmarks',
-                severity=_severity(joint),
-                numbers={'least_deg': float(least), 'most_deg': float(most)},
+                f'{low:.0f} and {high:.0f})'
             )
+            return _wrong_frames(joint, cause, least_deg=float(least), most_deg=float(most))
     return None
 
 
@@ -589,13 +585,19 @@ def _bends_elsewhere(motion: JointMotion) -> Finding | None:
     if main is None or not main[0] > MAX_AXIS_RAD < main[1]:
         return None
     degrees = float(np.rad2deg(main[1]))
+    cause = f'it bends about an axis {degrees:.0f} degrees from the flexion axis of its bones'
+    return _wrong_frames(joint, cause, axis_deg=degrees)
+
+
+def _wrong_frames(joint: Joint, cause: str, **numbers: float) -> Finding:
+    """Return the finding that a joint moves as none does between frames of these bones."""
     return Finding(
         Kind.JOINT_IMPOSSIBLE,
-        f'it bends about an axis {degrees:.0f} degrees from the flexion axis of its bones',
+        cause,
         place=Place(name=f'joint {joint.name}'),
         advice='check the side, which body is proximal, and the landmarks',
         severity=_severity(joint),
-        numbers={'axis_deg': degrees},
+        numbers=numbers,
     )
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..bodies.body import Body
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
+from ..exposures.frame import image_size_error
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place
 from ..images.extraction import Extraction, Nearby, extract_beads
@@ -187,12 +188,9 @@ class PhantomFollower:
     def _lens_of(self, size: tuple[int, int]) -> Lens:
         """Return the assumed lens. Raises DataError if the image size of a recording changes."""
         lens = self._settings.lens
-        if lens is not None and lens.image_size != size:
-            expected = lens.image_size
-            raise DataError(
-                f'the image is {size[0]} x {size[1]} px, but the first one is '
-                f'{expected[0]} x {expected[1]} px'
-            )
+        error = '' if lens is None else image_size_error(size, lens.image_size, 'the first one is')
+        if error:
+            raise DataError(error)
         if self._lens is None or self._lens.image_size != size:
             self._lens = assumed_lens(size, self._settings.principal_distance_px)
             self._views.clear()

@@ -145,9 +145,7 @@ class CalibrationSettings:
         {'pair_by': 'pair_by', 'tolerance_s': 'pair_tolerance'},
         settable=('pair_tolerance',),
     )
-    calibration: CalibrationOptions = group(
-        CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
-    )
+    calibration: CalibrationOptions = group(CalibrationOptions, _OF_REQUESTS, _OF_REQUESTS)
     angles: AngleOptions = group(AngleOptions)
     limits: CollectLimits = group(CollectLimits)
 

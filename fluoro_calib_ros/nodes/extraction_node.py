@@ -138,7 +138,7 @@ class ExtractionSettings:
     node: ExtractionParameters = group(ExtractionParameters)
     pairing: PairingOptions = group(PairingOptions, {'tolerance_s': 'pair_tolerance'})
     following: MarkerOptions = group(
-        MarkerOptions, {name: name for name in ('gate', 'shutter', 'lost_after', 'search_every')}
+        MarkerOptions, ('gate', 'shutter', 'lost_after', 'search_every')
     )
     angles: AngleOptions = group(AngleOptions)
 

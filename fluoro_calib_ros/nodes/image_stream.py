@@ -17,6 +17,7 @@ import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
+from ..exposures.frame import image_size_error
 from ..jobs.followers import FollowerSettings, Observations, follower_process
 from ..processes import LentArrays, WorkerProcess
 from .angle_input import AngleInput
@@ -73,14 +74,8 @@ class ImageStream(Stream):
         size = (image.shape[1], image.shape[0])
         if self._first is None:
             self._first = size, frame_id
-        elif size != self._first[0]:
-            expected = self._first[0]
-            raise self.converter.refusal(
-                'image size',
-                message,
-                f'the image is {size[0]} x {size[1]} px, but the first one is '
-                f'{expected[0]} x {expected[1]} px',
-            )
+        elif error := image_size_error(size, self._first[0], 'the first one is'):
+            raise self.converter.refusal('image size', message, error)
         return image
 
     def count(self, message: Image | CompressedImage, observations: Observations) -> None:

@@ -275,13 +275,7 @@ def adjust_and_estimate_noise(
     parameters = start
     settled = False
     for _ in range(40):  # a few are enough
-        result = adjust(
-            network,
-            parameters,
-            correction=correction,
-            noise=noise,
-            tolerance=LOOSE,
-        )
+        result = adjust(network, parameters, correction=correction, noise=noise, tolerance=LOOSE)
         parameters = result.parameters
         equations = normal_equations(network, parameters, correction, noise)
         blocks = covariance_blocks(factorize(network, equations))
@@ -291,13 +285,7 @@ def adjust_and_estimate_noise(
         if abs(noise.scale - last_scale) <= SETTLED * last_scale:
             settled = True
             break
-    result = adjust(
-        network,
-        parameters,
-        correction=correction,
-        noise=noise,
-        tolerance=tolerance,
-    )
+    result = adjust(network, parameters, correction=correction, noise=noise, tolerance=tolerance)
     return replace(result, converged=result.converged and settled)
 
 

@@ -83,24 +83,14 @@ def least_vectors_with_last_one(forms: NDArray[np.float64]) -> NDArray[np.float6
 def direct_linear_transformation(
     xyz: NDArray[np.float64],
     uv: NDArray[np.float64],
-    weights: NDArray[np.float64] | None = None,
-    least: Callable[[NDArray[np.float64]], NDArray[np.float64]] = least_vectors,
-) -> NDArray[np.float64]:
-    """Return projections (..., 3, k + 1) with uv ~ P (xyz, 1) of points in space or in a plane.
-
-    xyz (..., n, k), uv (..., n, 2) and weights (..., n) of n >= 6 points in space (k = 3), or
-    n >= 4 in a plane (k = 2). Coordinates are normalised (Hartley and Zisserman, algorithms 4.2
-    and 7.1). least: returns vectors (..., 3 k + 3) that minimise quadratic forms.
-    """
-    return _dlt_of_weights(xyz, uv, least)(weights)
-
-
-def _dlt_of_weights(
-    xyz: NDArray[np.float64],
-    uv: NDArray[np.float64],
     least: Callable[[NDArray[np.float64]], NDArray[np.float64]] = least_vectors,
 ) -> Callable[[NDArray[np.float64] | None], NDArray[np.float64]]:
-    """Return `direct_linear_transformation` of these points as a function of their weights."""
+    """Return projections (..., 3, k + 1) with uv ~ P (xyz, 1) as a function of the weights.
+
+    xyz (..., n, k), uv (..., n, 2) and weights (..., n), None for equal ones, of n >= 6 points in
+    space (k = 3), or n >= 4 in a plane (k = 2). Coordinates are normalised (Hartley and Zisserman,
+    algorithms 4.2 and 7.1). least: returns vectors (..., 3 k + 3) that minimise quadratic forms.
+    """
     x, to_x = _normalised(xyz)
     u, to_u = _normalised(uv)
     zero = np.zeros_like(x)
@@ -215,12 +205,12 @@ def _robust_dlt(columns: int, xyz_bytes: bytes, uv_bytes: bytes) -> NDArray[np.f
     size = SAMPLE_SIZE if len(extent) == 3 else PLANE_SAMPLE_SIZE
     samples = np.argpartition(rng.random((SAMPLES, len(xyz))), size)[:, :size]
     candidates = direct_linear_transformation(
-        xyz[samples], uv[samples], least=least_vectors_with_last_one
-    )
+        xyz[samples], uv[samples], least_vectors_with_last_one
+    )(None)
     squared = squared_residuals(candidates, xyz, uv)
     best = squared[np.argmin(np.median(squared, axis=1))]
     weights = np.zeros(len(xyz))
-    weighted = _dlt_of_weights(xyz, uv)
+    weighted = direct_linear_transformation(xyz, uv)
     for _ in range(DLT_ITERATIONS):
         last = weights
         weights = Noise(nu=NU).weight(best / robust_variance(best))

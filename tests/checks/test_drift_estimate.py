@@ -8,7 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.checks.drift_evidence import BlockRecord, EpipolarEvidence
+from fluoro_calib_ros.checks.drift_evidence import EpipolarEvidence
+from fluoro_calib_ros.checks.pair_watch import PairBlock
 
 AREAS = 3
 BEGIN, COUNT = 4, 10  # first block with the drift, and number of blocks
@@ -35,10 +36,11 @@ def estimate(series, area, size, factor=1.0, both=False):
         if block >= BEGIN:
             for one in {series, series ^ 1} if both else {series}:
                 score[one, area] = size * INFORMATION[block, one, area]
-        detail = np.zeros((1, 2, AREAS, 2))
-        detail[0, series % 2, area] = [3.0, -4.0]
-        record = BlockRecord(block * 10**9, score, INFORMATION[block], SYSTEMATIC[block], detail)
-        found.update(record, None, None)
+        normals = np.zeros((2, AREAS, 2))
+        normals[series % 2, area] = [3.0, -4.0]
+        enough = np.ones((4, AREAS), bool)
+        added = PairBlock(score, INFORMATION[block], SYSTEMATIC[block], enough, normals)
+        found.update(block * 10**9, added, None, None)
     return found.estimate(10.0)
 
 

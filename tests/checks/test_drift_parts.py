@@ -19,17 +19,13 @@ from fluoro_calib_ros.checks.drift_charts import (
     EVIDENCE_CAP,
     OK,
     WARN,
+    Block,
     DriftOptions,
     DriftState,
     EpipolarObservations,
     ImageAreas,
 )
-from fluoro_calib_ros.checks.drift_evidence import (
-    BlockRecord,
-    BodyEvidence,
-    DriftEstimate,
-    EpipolarEvidence,
-)
+from fluoro_calib_ros.checks.drift_evidence import BodyEvidence, DriftEstimate, EpipolarEvidence
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.checks.pair_watch import PairWatch, SystematicErrorField
 from fluoro_calib_ros.checks.rig_change import Addition, RigChange
@@ -380,10 +376,11 @@ def test_series_against_the_start_are_less_the_field_and_as_unsure_as_it():
 # ---- evidence
 
 
-def records(scores, informations):
-    """Records of one series and area, one per second."""
+def blocks(scores, informations):
+    """Blocks of one series and area, one per second, with their starts."""
+    zero = np.zeros((1, 1))
     return [
-        BlockRecord(10**9 * k, np.array([[s]]), np.array([[i]]), np.zeros((1, 1)), None)
+        (10**9 * k, Block(np.array([[s]]), np.array([[i]]), zero, zero > 0))
         for k, (s, i) in enumerate(zip(scores, informations))
     ]
 
@@ -401,9 +398,10 @@ def records(scores, informations):
 def test_a_drift_begins_where_the_newest_blocks_show_most(scores, informations, first):
     charts = Fake(evidence=np.zeros((2, 1, 1)))
     found = EpipolarEvidence(charts, ('a', 'b'), 4)
-    found._records.extend(records(scores, informations))
+    given = blocks(scores, informations)
+    found._records.extend(given)
     begin, run = found._run(0, 0, -7)
-    assert [one.begin_ns for one in run] == [10**9 * k for k in range(first, 4)]
+    assert run == [block for _, block in given[first:]]
     assert begin == (10**9 * first if first else -7)
     assert found._run(0, 0, 5 * 10**9)[0] == 10**9 * first
 
@@ -460,7 +458,7 @@ def test_a_drift_is_confirmed_by_the_other_bodies(scores, source, confirmed):
     score = np.zeros((3, 4, 2))
     score[:, 3, 1] = np.array(scores) / 2
     information = np.full((3, 4, 2), 12.5)
-    run = [Fake(detail=Fake(score=score, information=information))] * 2
+    run = [Fake(score_of_body=score, information_of_body=information)] * 2
     direction, _, told, is_confirmed = found._described(run, 3, 1)
     assert direction.tolist() == [0, 1] and told == source and is_confirmed is confirmed
 

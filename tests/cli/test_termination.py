@@ -3,12 +3,16 @@
 
 """Signals end a command, whatever it is doing at that moment."""
 
+import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+
+from fluoro_calib_ros.cli import output
 
 ROOT = Path(__file__).parents[2]
 
@@ -73,3 +77,21 @@ def test_what_cleans_up_is_not_interrupted():
     done = run(CLEANS_UP)
     assert done.returncode == 143, done.stderr
     assert done.stdout == 'cleaned up\n'
+
+
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT])
+def test_exception_that_is_lost_is_raised_again_and_again_until_the_command_has_ended(
+    number, monkeypatch
+):
+    monkeypatch.setattr(output, 'AGAIN_S', 0.02)
+    lost = []
+    with output.terminated_by_signals():
+        while len(lost) < 3:
+            try:
+                if not lost:
+                    os.kill(os.getpid(), number)
+                time.sleep(60)
+            except (SystemExit, KeyboardInterrupt) as error:
+                lost.append(error)
+    assert set(map(type, lost)) == {SystemExit if number == signal.SIGTERM else KeyboardInterrupt}
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

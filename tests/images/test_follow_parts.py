@@ -245,6 +245,35 @@ def test_a_prediction_is_that_of_a_white_acceleration():
     assert led.covariance[0, 0, 0] == pytest.approx(3600.0)
 
 
+def test_markers_led_by_others_are_where_their_standard_deviation_says():
+    """Of 14 markers of a body that is jolted, four are hidden for 30 images.
+
+    Half of an acceleration is that of the body: 0.75 of its variance.
+    """
+    told = []
+    for seed in range(15):
+        rng = np.random.default_rng([3, seed])
+        uv = rng.uniform(100, 900, (14, 2))
+        velocity = np.zeros((14, 2))
+        motion = Motion.start(uv, 0.05)
+        led = None
+        for image in range(90):
+            own = 0.5 * rng.normal(size=(14, 2))
+            acceleration = 0.3 * (np.sqrt(0.75) * rng.normal(size=2) + own)
+            uv = uv + velocity + acceleration / 2
+            velocity = velocity + acceleration
+            motion.predict(1, led)
+            before = motion.velocity.copy()
+            seen = (np.arange(14) >= 4) | (image < 60)
+            rows = np.flatnonzero(seen)
+            measured = uv[rows] + rng.normal(0, 0.05, (len(rows), 2))
+            motion.update(rows, measured, np.full(len(rows), 0.05), 1)
+            led = motion.lead(seen, before, np.ones(14, bool))
+            if image >= 75:
+                told.append((motion.uv[:4] - uv[:4]) ** 2 / motion.variance[:4, None])
+    assert 0.7 < np.mean(told) < 2.0
+
+
 @pytest.mark.parametrize(('together', 'is_known'), [(4, False), (5, True)])
 def test_velocities_are_compared_once_markers_were_seen_together(together, is_known):
     motion = moving(np.zeros((6, 2)), 1.0)
@@ -562,7 +591,7 @@ def test_outliers_of_responses_do_not_decide_between_poses():
     rng = np.random.default_rng(5)
     size = np.where(np.arange(64) < 3, 0.4, 0.0)
     decided = []
-    for _ in range(60):
+    for _ in range(40):
         uv = rng.uniform(100, 900, (64, 2))
         outlier = np.where(rng.random(64) < 0.15, rng.uniform(-1.5, 1.5, 64), 0)
         response = 2 * size + rng.normal(0, 0.1, 64) + outlier
@@ -573,6 +602,33 @@ def test_outliers_of_responses_do_not_decide_between_poses():
             decided.append(order[-1])
     assert len(decided) > 10
     assert set(decided) == {0}
+
+
+def test_sizes_tell_the_pose_where_most_responses_of_one_half_are_outliers():
+    """A sheet covers the left half: its beads overlap, and 60 % of responses tell no size."""
+    rng = np.random.default_rng(5)
+    size = np.where(np.arange(64) < 12, 0.4, 0.0)
+    leads = []
+    for _ in range(15):
+        uv = rng.uniform(100, 900, (64, 2))
+        covered = (uv[:, 0] < 500) & (rng.random(64) < 0.6)
+        response = 4 + uv[:, 1] / 4000 + 2 * size + rng.normal(0, 0.1, 64)
+        response += covered * rng.uniform(-1.5, 1.5, 64)
+        sizes = [size, *(rng.permutation(size) for _ in range(23))]
+        likelihoods = [matching._likelihood_of_sizes(one, response, uv) for one in sizes]
+        leads.append(likelihoods[0] - max(likelihoods[1:]))
+    assert np.count_nonzero(np.array(leads) > matching.LIKELIER) >= 14
+
+
+def test_one_bead_without_a_response_hardly_matters():
+    """No other bead is an outlier: the probability of one is not taken for zero."""
+    rng = np.random.default_rng(9)
+    size = np.where(np.arange(64) < 12, 0.4, 0.0)
+    uv = rng.uniform(100, 900, (64, 2))
+    response = 4 + 2 * size + rng.uniform(-0.1, 0.1, 64)
+    with_all = matching._likelihood_of_sizes(size, response, uv)
+    response[40] = np.log(1e-3)
+    assert 5 < with_all - matching._likelihood_of_sizes(size, response, uv) < 20
 
 
 def bodies_that_learn(monkeypatch, known):

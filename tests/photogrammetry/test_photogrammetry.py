@@ -213,7 +213,7 @@ def test_direct_linear_transformation_uses_its_weights():
     weights = np.ones(len(uv))
     spoilt[::4] += 200
     weights[::4] = 0
-    p = direct_linear_transformation(xyz, spoilt, weights)
+    p = direct_linear_transformation(xyz, spoilt)(weights)
     image = xyz @ p[:, :3].T + p[:, 3]
     np.testing.assert_allclose(image[:, :2] / image[:, 2:], uv, atol=1e-6)
 

@@ -11,7 +11,7 @@ calibration. The file does not contain the image size.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,8 @@ from .content import (
     FileSettings,
     Format,
     Points,
+    Reader,
+    Writer,
     Written,
     camera_at,
     common_focal_length,
@@ -167,7 +169,20 @@ def _write_grid(path: Path, content: Content, settings: FileSettings) -> Written
     return Written((str(path),))
 
 
-_OWN = 'CSV of fluoro_calib_ros'
+def _own(
+    kind: str, title: str, part: str, columns: Sequence[str], functions: tuple[Reader, Writer]
+) -> Format:
+    """Return a CSV format of this package, recognised by its columns; functions read and write."""
+    return Format(
+        kind,
+        f'{title}, CSV of fluoro_calib_ros',
+        parts=(part,),
+        recognise=lambda sample: has_columns(sample.lines, columns),
+        read=functions[0],
+        write=functions[1],
+    )
+
+
 FORMATS = (
     # Bags are read by the jobs, which also need other topics, such as the angles of C-arms.
     Format(
@@ -178,38 +193,16 @@ FORMATS = (
         read=None,
         write=_write_bag,
     ),
-    Format(
+    _own(
         'observations',
-        f'image points, {_OWN}',
-        parts=('observations',),
-        recognise=lambda sample: has_columns(sample.lines, OBSERVATIONS),
-        read=_read_observations,
-        write=_write_observations,
+        'image points',
+        'observations',
+        OBSERVATIONS,
+        (_read_observations, _write_observations),
     ),
-    Format(
-        'phantom',
-        f'phantom, {_OWN}',
-        parts=('survey',),
-        recognise=lambda sample: has_columns(sample.lines, PHANTOM),
-        read=_read_phantom,
-        write=_write_phantom,
-    ),
-    Format(
-        'points',
-        f'reconstructed points, {_OWN}',
-        parts=('points',),
-        recognise=lambda sample: has_columns(sample.lines, POINTS_NEEDED),
-        read=_read_points,
-        write=_write_points,
-    ),
-    Format(
-        'grid',
-        f'points of a distortion grid, {_OWN}',
-        parts=('grids',),
-        recognise=lambda sample: has_columns(sample.lines, GRID),
-        read=_read_grid,
-        write=_write_grid,
-    ),
+    _own('phantom', 'phantom', 'survey', PHANTOM, (_read_phantom, _write_phantom)),
+    _own('points', 'reconstructed points', 'points', POINTS_NEEDED, (_read_points, _write_points)),
+    _own('grid', 'points of a distortion grid', 'grids', GRID, (_read_grid, _write_grid)),
 )
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from ..access import PathLike, read_text, write_text
-from ..documents import check_budget, numbers_of, read_toml, read_yaml
+from ..documents import check_yaml, numbers_of, read_toml, read_yaml
 from .content import (
     Camera,
     Content,
@@ -47,7 +47,7 @@ DISTORTION_NAMES = ('distortion_coefficients', 'Distortion_Coefficients', 'distC
 def _read_opencv(path: Path, settings: FileSettings) -> Content:
     """Read a camera, named after the file. Raises DataError."""
     text = read_text(path)
-    check_budget('YAML', text, path)  # OpenCV crashes on deep nesting
+    check_yaml(text, path)  # OpenCV crashes on deep nesting
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (cv2.error, SystemError):

@@ -42,6 +42,8 @@ DIRECTIONS = (
     *('tilt 15', 'tilt 30', 'tilt 45', 'tilt 60'),
 )
 NEAREST = {'centred': 'orbit 15', 'tilt 60': 'tilt 45'}  # of directions that are not calibrated
+ORBIT = {'centred': 0, 'orbit 15': 15, 'orbit 30': 30, 'orbit 45': 45, 'orbit 60': 60}  # angles
+BETWEEN = 'orbit 30'  # direction that is corrected from the others of the orbit
 OPENCV = {
     'OpenCV, Brown': 0,
     'OpenCV, rational, thin prism, tilt': (
@@ -70,6 +72,16 @@ nearest other direction; **lookup table**: local weighted mean.
 {rows}
 
 Standard deviations that this package states for the corrected holes, RMS [px]: {stated}.
+
+**Between calibrated angles.** The image at an orbit of 30 degrees, corrected from those at 0, 15, 45
+and 60 degrees: with their angles, without, or from lookup tables. The lookup table of the image
+itself shows the errors of the drilling.
+
+| correction | sheet, {between} |
+| --- | --- |
+{orbit}
+
+Standard deviations that this package states, RMS [px]: {orbit_stated}.
 
 **Another target.** Residuals [px] of an adjustment of the nine images of the fiducial, with free
 coordinates ({fiducial_sd} mm) and without a correction of its own. Each image is corrected from
@@ -188,14 +200,22 @@ def repeatability(one: Points, other: Points) -> float:
 
 
 def ours(
-    place: Workplace, points: pandas.DataFrame, train: list[str], distance: float
+    place: Workplace,
+    points: pandas.DataFrame,
+    train: list[str],
+    distance: float,
+    angles: Mapping[int, float] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels (n, 2) corrected from sheets in some directions, and stated sd (n,) [px].
 
-    Pixels outside of the calibrated area are NaN.
+    Pixels outside of the calibrated area are NaN. angles: of the exposures [degrees].
     """
     shown = place.points['exposure'].isin([sheet_number(direction) for direction in train])
-    place.calibrated(place.points[shown], 'sheets', '--principal-distance', f'{distance}')
+    given = place.points[shown]
+    if angles is not None:
+        given = given.assign(angle_deg=given['exposure'].map(angles))
+        points = points.assign(angle_deg=points['exposure'].map(angles))
+    place.calibrated(given, 'sheets', '--principal-distance', f'{distance}')
     found = place.corrected(points, 'sheets')
     pixels = found[['u_corrected', 'v_corrected']].to_numpy()
     is_valid = (found['status'] == 'OK').to_numpy()[:, None]
@@ -225,6 +245,28 @@ def held_out(
     for kind, directions in (('others', train), ('one', [near])):
         name = f'{kind}: {OURS}'
         moved[name], sd[name] = ours(place, shown, directions, distance)
+    used = np.isfinite([*moved.values()]).all(axis=(0, 2))
+    errors = {name: off_the_drawing(test.xyz[used], uv[used]) for name, uv in moved.items()}
+    return errors, {name: float(np.sqrt(np.mean(of[used] ** 2))) for name, of in sd.items()}
+
+
+def between_angles(place: Workplace, distance: float) -> tuple[dict[str, float], dict[str, float]]:
+    """Return errors between calibrated angles, and our stated sd, by correction."""
+    number = sheet_number(BETWEEN)
+    test = place.image(number)
+    shown = place.points[place.points['exposure'] == number]
+    train = [direction for direction in ORBIT if direction != BETWEEN]
+    angles = {sheet_number(direction): angle for direction, angle in ORBIT.items()}
+    by_table = {name: lookup_table(place.image(sheet_number(name)))(test.uv) for name in ORBIT}
+    neighbours = [by_table[name] for name in ORBIT if abs(ORBIT[name] - ORBIT[BETWEEN]) == 15]
+    moved = {
+        'lookup table of the image itself': by_table[BETWEEN],
+        'lookup table of the nearest angle': neighbours[0],
+        'mean of the lookup tables of both neighbours': np.mean(neighbours, axis=0),
+    }
+    sd = {}
+    for name, known in ((f'{OURS}, angles unknown', None), (f'{OURS}, with the angles', angles)):
+        moved[name], sd[name] = ours(place, shown, train, distance, known)
     used = np.isfinite([*moved.values()]).all(axis=(0, 2))
     errors = {name: off_the_drawing(test.xyz[used], uv[used]) for name, uv in moved.items()}
     return errors, {name: float(np.sqrt(np.mean(of[used] ** 2))) for name, of in sd.items()}
@@ -280,6 +322,7 @@ class Figures:
     repeats: list[float]  #: of the pairs of images
     errors: Mapping[str, dict[str, float]]
     stated: Mapping[str, dict[str, float]]
+    orbit: tuple[dict[str, float], dict[str, float]]  #: errors and stated sd between angles [px]
     fiducial: dict[str, float]  #: residuals by correction [px]
     noise: float  #: RMS of the standard deviations of the balls [px]
 
@@ -302,6 +345,9 @@ class Figures:
                 f'{direction}: {", ".join(f"{name} {sd:.3f}" for name, sd in of.items())}'
                 for direction, of in self.stated.items()
             ),
+            between=BETWEEN,
+            orbit='\n'.join(f'| {name} | {px:.3f} |' for name, px in self.orbit[0].items()),
+            orbit_stated=', '.join(f'{name} {px:.3f}' for name, px in self.orbit[1].items()),
             fiducial_sd=FIDUCIAL_SD_MM,
             noise=self.noise,
             fiducial='\n'.join(f'| {name} | {px:.3f} |' for name, px in self.fiducial.items()),
@@ -327,8 +373,10 @@ def main() -> None:
         for direction in NEAREST:
             errors[direction], stated[direction] = held_out(place, direction, distance)
             print(direction, errors[direction], stated[direction], flush=True)
+        orbit = between_angles(place, distance)
+        print(BETWEEN, *orbit, flush=True)
         fiducial = of_fiducial(place, distance)
-    text = Figures(distance, repeats, errors, stated, fiducial, noise).text()
+    text = Figures(distance, repeats, errors, stated, orbit, fiducial, noise).text()
     print(text)
     if options.page:
         write_section(options.page, 'c-arm', text)

@@ -73,8 +73,8 @@ nearest other direction; **lookup table**: local weighted mean.
 
 Standard deviations that this package states for the corrected holes, RMS [px]: {stated}.
 
-**Between calibrated angles.** The image at an orbit of 30 degrees, corrected from those at 0, 15, 45
-and 60 degrees: with their angles, without, or from lookup tables. The lookup table of the image
+**Between calibrated angles.** The image at an orbit of 30 degrees, corrected from those at 0, 15,
+45 and 60 degrees: with their angles, without, or from lookup tables. The lookup table of the image
 itself shows the errors of the drilling.
 
 | correction | sheet, {between} |
@@ -376,7 +376,10 @@ def main() -> None:
         orbit = between_angles(place, distance)
         print(BETWEEN, *orbit, flush=True)
         fiducial = of_fiducial(place, distance)
-    text = Figures(distance, repeats, errors, stated, orbit, fiducial, noise).text()
+    figures = Figures(
+        distance, repeats, errors, stated, orbit=orbit, fiducial=fiducial, noise=noise
+    )
+    text = figures.text()
     print(text)
     if options.page:
         write_section(options.page, 'c-arm', text)

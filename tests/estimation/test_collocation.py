@@ -938,6 +938,21 @@ def test_claims_hold_for_unseen_exposures_where_the_distortion_varies():
     assert 0.6 < square / np.sum(table.redundancy[good]) < 1.6
 
 
+@pytest.mark.long
+def test_changes_beyond_cubic_are_followed():
+    """Cubic terms of the exposures leave residuals of 0.243 px; without a change, 0.199 px."""
+    rng = np.random.default_rng(6)
+    frames = []
+    for frame in simulate_exposures(virtual_rig(5), 10, 5).frames['a']:
+        x, y = ((frame.uv - 511.5) / 512).T
+        terms = np.stack([x**4, y**4, x * x * y * y], axis=1)
+        uv = np.clip(frame.uv + terms @ rng.normal(0, 3.0, (3, 2)), 0, 1022)
+        frames.append(replace(frame, uv=uv))
+    result = calibrate({'a': frames}, virtual_rig(5).phantom)
+    table = result.residuals
+    assert np.sqrt(np.mean(table.residual[~table.outlier] ** 2)) < 0.21
+
+
 @pytest.mark.parametrize('exposures', [4, 14])  # eliminates the points, or the exposures
 def test_coefficients_at_the_solution_of_an_adjustment_that_stopped_before(exposures):
     """If its prior nearly fixes a coefficient, the pull on it is visible only at the solution."""

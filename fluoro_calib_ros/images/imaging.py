@@ -111,7 +111,7 @@ def estimate_profile(
     # Skip the initial guess: it fits shadows as small as their blur about as well.
     estimates = [start, profiles[-1]] if is_known else profiles[1:] or profiles
     fits = [
-        _profile_fit(light, place, shapes, profile=profile, reach_px=reach_px, former=closest)
+        _profile_fit(light, uv[alone], shapes, profile=profile, reach_px=reach_px, former=closest)
         for profile in estimates
     ]
     return min(fits, key=ShadowFit.typical).profile
@@ -138,11 +138,12 @@ def _profile_fit(
     """Fit shadows with a fixed profile, in windows that reach at least as far as reach_px.
 
     shapes: shapes and sizes of the beads, as in `measure_beads`. former: fit of another profile,
-    whose light without beads is the initial one. What clipped pixels tell depends on the noise;
-    it follows from the former fit, too.
+    whose light without beads is the initial one in a clipped image. What clipped pixels tell
+    depends on the noise; it follows from the former fit, too.
     """
     gain = 1.0
-    if former and light.clipping:
+    former = former if light.clipping else None
+    if former:
         gain = max(_lack(former), MIN_VARIANCE / float(np.median(former.background.light)))
     noise = Noise(0.0, gain, np.ones((1, 1)))
     shape, size = shapes
@@ -255,6 +256,8 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         return imaging
     shapes = shadows.shape[rows], size[rows]
     fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)
+    if light.clipping:  # the light that clipped pixels hide has not converged
+        fit = _profile_fit(light, shadows.uv[rows], shapes, profile=imaging.profile, former=fit)
     if np.median(fit.common_share()) < COMMON:
         return imaging
     isolated = replace(shadows, alone=alone)
@@ -267,7 +270,16 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     if profile.sharpening < MIN_SHARPENING:
         profile = replace(profile, sharpening=0.0, mask_px=0.0)
     plain, masked = (
-        _profile_fit(light, shadows.uv[rows], shapes, one, profile.reach_px).typical()
+        _lack(
+            _profile_fit(
+                light,
+                shadows.uv[rows],
+                shapes,
+                profile=one,
+                reach_px=profile.reach_px,
+                former=fit,
+            )
+        )
         for one in (imaging.profile, profile)
     )
     if masked >= BETTER * plain:

@@ -166,7 +166,8 @@ class BeadFit(ShadowFit):
         to the model of their window.
         """
         active = np.ones(len(self.uv), dtype=bool)
-        if self.hidden and steps >= STEPS:
+        hides = self.hidden is not None and steps >= STEPS
+        if hides:  # a background beyond the polynomial is looked for when the spread is known
             steps += HIDDEN_STEPS
         for step in range(steps):
             final = step == steps - 1
@@ -187,7 +188,7 @@ class BeadFit(ShadowFit):
                 self.uv[kept] = uv[~lost]
                 self.depth[kept] = depth[~lost]
                 self.background.terms[kept] = background[~lost]
-            if step == steps // 2:
+            if step == (steps - FIRST_STEPS if hides else steps // 2):
                 self.disturbed = self.misfit > DISTURBED * self.typical()
                 if steps >= STEPS:
                     self._add_texture()

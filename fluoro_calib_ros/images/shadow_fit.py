@@ -434,7 +434,8 @@ def _deviations(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64
         influence = np.linalg.solve(equations.matrix, equations.weighted)
         kept = np.clip(1 - (jacobian * influence).sum(axis=1), MIN_KEPT, 1)
         known = (information > KNOWN) & fit.clipping.leaves(light)
-        known &= (fit.usable[rows] & (fit.misfit[rows] <= DISTURBED * fit.typical()))[:, None]
+        usual = fit.usable[rows] & (fit.misfit[rows] <= DISTURBED * fit.typical())
+        known &= (usual & (fit.texture.strength[rows] == 0))[:, None]
         out.append(np.stack([light, np.abs(residual) / np.sqrt(kept)])[:, known])
     light, residual = np.concatenate(out, axis=1)
     return light, residual

@@ -18,12 +18,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .detection import LARGER
-from .light import Light, Noise, vertex
+from .light import MIN_VARIANCE, Light, Noise, vertex
 from .measurement import FIRST_STEPS, RADIUS_SD, STEPS, BeadFit, rounded, scatter_equation
 from .profile import LIMITS, MASKED, PLAIN, SHAPE, Profile, fit_profile
 from .shadow_fit import DISTURBED, ShadowFit, noise_of_windows
 
 PROFILE_STEPS = 3
+# The same where pixels are clipped: the light that they hide converges more slowly. With 3, 268 of
+# 291 beads were measured in 10 over-exposed renderings with plates, with 4 282, with 5 284.
+CLIPPED_STEPS = 4
 PROFILE_BEADS = 100  # largest number of beads for the profile
 # Rounds without a better fit, after which the best profile is chosen in windows of equal size: a
 # hard edge with a wide blur looks like a sphere. If the radius grows by a half, fits get worse
@@ -86,11 +89,16 @@ def estimate_profile(
     least_reach_px = start.reach_px if start.sharpening else 0.0
     profiles = [start]
     lacks: list[float] = []
+    fit: BeadFit | None = None
+    closest: BeadFit | None = None
     while len(lacks) < PROFILE_ROUNDS and len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
         before = profiles[-1]
-        fit = _profile_fit(light, place, shapes, before, least_reach_px)
+        fit = _profile_fit(
+            light, place, shapes, profile=before, reach_px=least_reach_px, former=fit
+        )
         place = fit.uv
-        lacks.append(fit.typical())
+        lacks.append(_lack(fit))
+        closest = fit if lacks[-1] == min(lacks) else closest
         profile = fit_profile(fit.absorbed(), before, estimated)
         if not radius_px / MOST < profile.radius_px < radius_px * MOST:
             break
@@ -102,7 +110,10 @@ def estimate_profile(
     reach_px = max(profile.reach_px for profile in profiles)
     # Skip the initial guess: it fits shadows as small as their blur about as well.
     estimates = [start, profiles[-1]] if is_known else profiles[1:] or profiles
-    fits = [_profile_fit(light, uv[alone], shapes, profile, reach_px) for profile in estimates]
+    fits = [
+        _profile_fit(light, uv[alone], shapes, profile=profile, reach_px=reach_px, former=closest)
+        for profile in estimates
+    ]
     return min(fits, key=ShadowFit.typical).profile
 
 
@@ -122,19 +133,33 @@ def _profile_fit(
     shapes: tuple[NDArray[np.float64], NDArray[np.float64] | None],
     profile: Profile,
     reach_px: float = 0.0,
+    former: BeadFit | None = None,
 ) -> BeadFit:
     """Fit shadows with a fixed profile, in windows that reach at least as far as reach_px.
 
-    shapes: shapes and sizes of the beads, as in `measure_beads`.
+    shapes: shapes and sizes of the beads, as in `measure_beads`. former: fit of another profile,
+    whose light without beads is the initial one in a clipped image. What clipped pixels tell
+    depends on the noise; it follows from the former fit, too.
     """
-    noise = Noise(0.0, 1.0, np.ones((1, 1)))
+    gain = 1.0
+    former = former if light.clipping else None
+    if former:
+        gain = max(_lack(former), MIN_VARIANCE / float(np.median(former.background.light)))
+    noise = Noise(0.0, gain, np.ones((1, 1)))
     shape, size = shapes
     fit = BeadFit(light, uv, shape, profile=profile, noise=noise, size=size, reach_px=reach_px)
+    if former:
+        fit.background.start(former.background.light, fit.background.around, profile.scatter)
     fit.background.plane_only = True
     fit.hidden = None
     fit.background.spread[:] = np.inf
-    fit.run(PROFILE_STEPS)
+    fit.run(CLIPPED_STEPS if light.clipping else PROFILE_STEPS)
     return fit
+
+
+def _lack(fit: BeadFit) -> float:
+    """Return the typical lack of fit with a fixed profile, the noise over the light."""
+    return fit.typical() * fit.noise.gain
 
 
 @dataclass(frozen=True)
@@ -231,6 +256,8 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         return imaging
     shapes = shadows.shape[rows], size[rows]
     fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)
+    if light.clipping:  # the light that clipped pixels hide has not converged
+        fit = _profile_fit(light, shadows.uv[rows], shapes, profile=imaging.profile, former=fit)
     if np.median(fit.common_share()) < COMMON:
         return imaging
     isolated = replace(shadows, alone=alone)
@@ -243,7 +270,16 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     if profile.sharpening < MIN_SHARPENING:
         profile = replace(profile, sharpening=0.0, mask_px=0.0)
     plain, masked = (
-        _profile_fit(light, shadows.uv[rows], shapes, one, profile.reach_px).typical()
+        _lack(
+            _profile_fit(
+                light,
+                shadows.uv[rows],
+                shapes,
+                profile=one,
+                reach_px=profile.reach_px,
+                former=fit,
+            )
+        )
         for one in (imaging.profile, profile)
     )
     if masked >= BETTER * plain:

@@ -33,16 +33,20 @@ from .shadow_fit import (
 )
 from .texture import DTYPE
 
+FIRST_STEPS = 3  # steps that only have to separate beads from other objects
 SETTINGS = FitSettings(
     steps=5,
     crossing_steps=(2, 3),
+    spread_step=FIRST_STEPS,  # before, the lack of fit is that of the initial values
     crowds=((1, 2), (3, 6)),
     max_step_px=0.6,
     pooled=60.0,
     crossed=1.0,
 )
 STEPS = SETTINGS.steps
-FIRST_STEPS = 3  # steps that only have to separate beads from other objects
+# Further steps if clipped pixels hide light, whose spread is estimated before each step. In 20
+# over-exposed renderings with bone or plates, ten gave the same normalised errors to 6 %.
+HIDDEN_STEPS = 5
 # Largest step of a coordinate of a bead that has converged: the next step is about ten times
 # shorter, and the centres of the sharpest beads are known to 0.01 px.
 SETTLED_PX = 0.003
@@ -162,6 +166,9 @@ class BeadFit(ShadowFit):
         to the model of their window.
         """
         active = np.ones(len(self.uv), dtype=bool)
+        hides = self.hidden is not None and steps >= STEPS
+        if hides:  # a background beyond the polynomial is looked for when the spread is known
+            steps += HIDDEN_STEPS
         for step in range(steps):
             final = step == steps - 1
             if step in self.settings.crossing_steps:
@@ -181,7 +188,7 @@ class BeadFit(ShadowFit):
                 self.uv[kept] = uv[~lost]
                 self.depth[kept] = depth[~lost]
                 self.background.terms[kept] = background[~lost]
-            if step == steps // 2:
+            if step == (steps - FIRST_STEPS if hides else steps // 2):
                 self.disturbed = self.misfit > DISTURBED * self.typical()
                 if steps >= STEPS:
                     self._add_texture()
@@ -313,14 +320,17 @@ class BeadFit(ShadowFit):
         light = np.empty_like(self.grey)
         for rows, near in self.groups:
             light[rows] = self._model(rows, near)[0]
-        # Where the expected light is clipped, only pixels with noise of one sign are not.
-        known = self.valid & self.clipping.leaves(light) & self.clipping.leaves(self.grey)
+        # Clipped pixels near the bound count as well: without them, only noise of one sign does.
+        variance = self.noise.variance(light)
+        residual, information = self.clipping.observed(self.grey, light, variance)
+        known = self.valid & (information > 0)
         good = (
             known & (self.measured & (self.misfit < UNDISTURBED * np.median(self.misfit)))[:, None]
         )
         weight = plane**2 / np.maximum(light, 0.02 * plane) / np.maximum(np.median(plane), 1e-9)
+        weight *= information
         size = np.broadcast_to(rounded(self.size, 1 + RADIUS_SD)[:, None], good.shape)
-        share = 1 - self.grey / plane
+        share = 1 - (light + residual) / plane
         around = self.background.around[:, None] / plane
         return Absorbed(*(one[good] for one in (distance, share, weight, size, around)))
 

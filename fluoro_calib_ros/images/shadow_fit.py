@@ -83,6 +83,7 @@ class FitSettings:
     max_step_px: float  #: largest step of a centre
     pooled: float  #: degrees of freedom with which the noise of all beads enters that of each bead
     crossed: float  #: factor on the standard deviation where shadows cross
+    spread_step: int = 1  #: from which the spread of light that clipped pixels hide is estimated
 
     @property
     def neighbours(self) -> int:
@@ -289,7 +290,7 @@ class ShadowFit(ABC):
 
     def _renew_prior(self, step: int) -> bool:
         """Renew the prior of light that clipped pixels hide, if any; return whether it changed."""
-        if self.hidden and step:
+        if self.hidden and step >= self.settings.spread_step:
             self.background.spread = self.hidden.spread(self.usable, self.typical())
         return self.hidden is not None
 
@@ -433,7 +434,8 @@ def _deviations(fit: ShadowFit) -> tuple[NDArray[np.float64], NDArray[np.float64
         influence = np.linalg.solve(equations.matrix, equations.weighted)
         kept = np.clip(1 - (jacobian * influence).sum(axis=1), MIN_KEPT, 1)
         known = (information > KNOWN) & fit.clipping.leaves(light)
-        known &= (fit.usable[rows] & (fit.misfit[rows] <= DISTURBED * fit.typical()))[:, None]
+        usual = fit.usable[rows] & (fit.misfit[rows] <= DISTURBED * fit.typical())
+        known &= (usual & (fit.texture.strength[rows] == 0))[:, None]
         out.append(np.stack([light, np.abs(residual) / np.sqrt(kept)])[:, known])
     light, residual = np.concatenate(out, axis=1)
     return light, residual
@@ -524,6 +526,9 @@ def _inflation(influence: NDArray[np.float64], correlation: NDArray[np.float64])
 
 
 def _sd_of_centre(covariance: np.ndarray) -> NDArray[np.float64]:
-    """Return standard deviations (g,) of a coordinate of centres from covariances (g, u, u)."""
+    """Return standard deviations (g,) of a coordinate of centres from covariances (g, u, u).
+
+    They are infinite where rounding errors leave no variance.
+    """
     variance = 0.5 * (covariance[:, TERMS, TERMS] + covariance[:, TERMS + 1, TERMS + 1])
-    return np.sqrt(np.maximum(variance, 0))
+    return np.sqrt(np.where(variance > 0, variance, np.inf))

@@ -429,6 +429,40 @@ def test_scattered_light_stays_where_shadows_are_not_those_of_spheres():
     assert imaging.profile == _typical(light, shadows, np.ones(36), RADIUS)
 
 
+def over_exposed(seed: int, bright: float, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a radiograph of equal spheres whose light has slopes, clipped; centres (n, 2)."""
+    rng = np.random.default_rng(seed)
+    count = 36
+    _, uv = image_of(np.full(count, RADIUS), 1.2, seed)
+    slope = 0.004 * rng.standard_t(4, (count, 2))
+    size = PITCH * 6
+    light = np.zeros((FINE * size, FINE * size))
+    cell = np.arange(FINE * PITCH)
+    for number, centre in enumerate(uv):
+        row, column = np.multiply(np.divmod(number, 6), FINE * PITCH)[:, None] + cell
+        x, y = ((at + 0.5) / FINE - 0.5 - c for at, c in zip((column, row), centre))
+        chord = 2 * np.sqrt(np.maximum(RADIUS**2 - x**2 - y[:, None] ** 2, 0))
+        across = slope[number, 0] * x + slope[number, 1] * y[:, None]
+        light[np.ix_(row, column)] = bright * np.exp(np.maximum(across, -0.4) - ABSORBED * chord)
+    light = cv2.GaussianBlur(light, (0, 0), FINE * 1.2)
+    light = light.reshape(size, FINE, size, FINE).mean(axis=(1, 3))
+    return np.minimum(rng.poisson(light), most).astype(np.float32), uv
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_the_shadow_of_a_bead_is_estimated_in_over_exposed_images(seed):
+    """Only the insides of shadows are visible, up to three quarters of the light around."""
+    image, uv = over_exposed(seed, 900.0, 700.0)
+    light = Light(image, np.ones(image.shape, bool), Clipping(high=700.0))
+    n = len(uv)
+    shadows = Expected(np.arange(n), uv, circles(np.ones(n)), np.ones(n, bool), np.ones(n, bool))
+    noise = Noise(0.0, 1.0, np.eye(1))
+    profile = first_imaging(light, noise, shadows, RADIUS, size=np.ones(n)).profile
+    assert profile.radius_px == pytest.approx(RADIUS, rel=0.02)
+    assert profile.blur_px == pytest.approx(1.2, rel=0.1)
+    assert profile.attenuation * (1 - profile.scatter) == pytest.approx(ABSORBED * RADIUS, rel=0.1)
+
+
 @pytest.mark.parametrize(
     ('factor', 'scatter', 'clipped'), [(0.0, 0.1, 0), (1.5, 0.1, 0), (1.5, 0.02, 50)]
 )

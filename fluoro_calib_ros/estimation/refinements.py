@@ -192,7 +192,7 @@ def exposure_terms(solution: Solution) -> Changes:
     for part in solution.parts:
         modes = min(part.functions.complete, START_MODES)
         out[part.number] = Change(modes)
-        if len(np.unique(part.exposure)) > MAX_VARYING_EXPOSURES:
+        if not 1 < len(np.unique(part.exposure)) <= MAX_VARYING_EXPOSURES:
             continue
         points = part.inliers(solution.adjustment)
         gauge = part.image_size, part.interior

@@ -627,7 +627,7 @@ def test_what_is_followed_is_the_posterior_with_the_proposed_prior():
 
 
 def test_terms_of_exposures_that_follow_an_angle_have_those_of_the_interior():
-    """Modes do not exceed the initial number; too many exposures get no terms."""
+    """Modes do not exceed the initial number; one exposure, or too many, get no terms."""
     rng = np.random.default_rng(12)
     exposures = 8
     uv = rng.uniform(0, 1024, (100 * exposures, 2))
@@ -660,6 +660,7 @@ def test_terms_of_exposures_that_follow_an_angle_have_those_of_the_interior():
     assert unknown.own.count == 14 * exposures
     assert unknown.modes == START_MODES
     assert proposed(np.zeros(0), 40, np.arange(len(uv)) // 13) is None
+    assert proposed(np.zeros(0), 40, np.zeros(len(uv), dtype=int)) is None
 
 
 # ---- expert terms

@@ -195,8 +195,8 @@ def exposure_terms(solution: Solution) -> Changes:
         if not 1 < len(np.unique(part.exposure)) <= MAX_VARYING_EXPOSURES:
             continue
         points = part.inliers(solution.adjustment)
-        gauge = part.image_size, part.interior
-        functions = exposure_functions(points.uv, *gauge, degree=QUINTIC)
+        geometry = part.image_size, part.interior
+        functions = exposure_functions(points.uv, *geometry, degree=QUINTIC)
         cubic = variation(points.residuals, points.exposure, functions[:, :, :TERMS])
         if not cubic.is_varying:
             continue
@@ -205,7 +205,7 @@ def exposure_terms(solution: Solution) -> Changes:
         is_flat = part.gauge_kind is GaugeKind.TREND  # and shows no change of the interior
         functions = exposure_functions(
             part.uv,
-            *gauge,
+            *geometry,
             with_interior=can_be_fitted(part.angles) and not is_flat,
             kind=GaugeKind.TREND if is_flat else GaugeKind.FULL,
             degree=degree,

@@ -140,7 +140,7 @@ class _Secants:
     Limited-memory BFGS (Nocedal and Wright, "Numerical Optimization", 2nd ed. 2006, algorithm
     7.4), with a factorized normal matrix as initial approximation. With redescending weights the
     normal matrix is far larger than the second derivatives in some directions, and steps with it
-    alone creep. Positions where the gradient was evaluated are in the order of their steps.
+    alone creep. Call `arrived` at each position, and `moved` with the step from there.
     """
 
     def __init__(self) -> None:

@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
+import threading
 from pathlib import Path
 
 import pytest
@@ -84,13 +84,14 @@ def test_exception_that_is_lost_is_raised_again_and_again_until_the_command_has_
     number, monkeypatch
 ):
     monkeypatch.setattr(output, 'AGAIN_S', 0.02)
+    nothing = threading.Event()
     lost = []
     with output.terminated_by_signals():
         while len(lost) < 3:
             try:
                 if not lost:
                     os.kill(os.getpid(), number)
-                time.sleep(60)
+                nothing.wait(60)
             except (SystemExit, KeyboardInterrupt) as error:
                 lost.append(error)
     assert set(map(type, lost)) == {SystemExit if number == signal.SIGTERM else KeyboardInterrupt}

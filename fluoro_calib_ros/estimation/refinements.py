@@ -196,10 +196,11 @@ def exposure_terms(solution: Solution) -> Changes:
             continue
         points = part.inliers(solution.adjustment)
         geometry = part.image_size, part.interior
-        functions = exposure_functions(points.uv, *geometry, degree=QUINTIC)
-        cubic = variation(points.residuals, points.exposure, functions[:, :, :TERMS])
+        functions = exposure_functions(points.uv, *geometry)
+        cubic = variation(points.residuals, points.exposure, functions)
         if not cubic.is_varying:
             continue
+        functions = exposure_functions(points.uv, *geometry, degree=QUINTIC)
         higher = variation(points.residuals, points.exposure, functions, TERMS)
         degree = QUINTIC if higher.chi2_per_dof > MORE_THAN_NOISE else CUBIC
         is_flat = part.gauge_kind is GaugeKind.TREND  # and shows no change of the interior

@@ -917,16 +917,22 @@ def test_random_rigs_converge_to_the_right_answer(seed):
     assert result['end'] == 'converged' and not result['wrong']
 
 
+def differently_bent(exposures, terms_at, size_px, seed):
+    """Exposures with other amounts of some terms (n, k) of the place in each."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for frame in simulate_exposures(virtual_rig(5), exposures, 5).frames['a']:
+        terms = np.stack(terms_at(*((frame.uv - 511.5) / 512).T), axis=1)
+        bend = rng.normal(0, size_px, (terms.shape[1], 2))
+        frames.append(replace(frame, uv=np.clip(frame.uv + terms @ bend, 0, 1022)))
+    return frames
+
+
 @pytest.mark.long
 def test_claims_hold_for_unseen_exposures_where_the_distortion_varies():
-    rng = np.random.default_rng(4)
-    frames = []
-    for frame in simulate_exposures(virtual_rig(5), 20, 5).frames['a']:
-        x, y = ((frame.uv - 511.5) / 512).T
-        terms = np.stack([x * y * y, y * x * x, x**3, y**3], axis=1)
-        bend = rng.normal(0, 0.8, (4, 2))
-        uv = np.clip(frame.uv + terms @ bend, 0, 1022)
-        frames.append(replace(frame, uv=uv))
+    frames = differently_bent(
+        20, lambda x, y: [x * y * y, y * x * x, x**3, y**3], size_px=0.8, seed=4
+    )
     phantom = virtual_rig(5).phantom
     result = calibrate({'a': frames[::2]}, phantom)
     calibration = result.calibrations['a']
@@ -941,13 +947,7 @@ def test_claims_hold_for_unseen_exposures_where_the_distortion_varies():
 @pytest.mark.long
 def test_changes_beyond_cubic_are_followed():
     """Cubic terms of the exposures leave residuals of 0.243 px; without a change, 0.199 px."""
-    rng = np.random.default_rng(6)
-    frames = []
-    for frame in simulate_exposures(virtual_rig(5), 10, 5).frames['a']:
-        x, y = ((frame.uv - 511.5) / 512).T
-        terms = np.stack([x**4, y**4, x * x * y * y], axis=1)
-        uv = np.clip(frame.uv + terms @ rng.normal(0, 3.0, (3, 2)), 0, 1022)
-        frames.append(replace(frame, uv=uv))
+    frames = differently_bent(10, lambda x, y: [x**4, y**4, x * x * y * y], size_px=3.0, seed=6)
     result = calibrate({'a': frames}, virtual_rig(5).phantom)
     table = result.residuals
     assert np.sqrt(np.mean(table.residual[~table.outlier] ** 2)) < 0.21

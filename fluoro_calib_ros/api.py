@@ -51,6 +51,7 @@ from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, r
 from .jobs.result_folder import save_outcome, save_result
 from .jobs.simulation import SimulationOptions, simulate
 from .jobs.sources import (
+    BagSelection,
     Recording,
     Survey,
     read_calibrations,
@@ -254,7 +255,8 @@ def _recording_in(
     """Read the exposures of a bag or file, or extract the beads of images. Raises DataError."""
     if not contains_images(source):
         settings = FileSettings(names=survey.names)
-        return read_source(source, collect='auto', settings=settings)
+        selection = BagSelection(phantom=survey.phantom)
+        return read_source(source, collect='auto', settings=settings, selection=selection)
     report_image = None if progress is None else partial(progress, 'image')
     return recording_of_images(
         source, survey, principal_distance_px=principal_distance, progress=report_image

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.targets import facing
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.correction.angle_field import AngleField
 from fluoro_calib_ros.correction.calibration_record import HARMONICS, SD_GRID, VARIANCES
@@ -22,6 +23,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
 from fluoro_calib_ros.io.bags.metadata import (
     TARGET_OBSERVATIONS,
     message_from_frame,
@@ -129,6 +131,45 @@ def rig():
 def exposures(count=15, seed=1):
     """Return {fluoroscope: [Frame, ...]} of the rig; cached, so do not modify the frames."""
     return simulate_exposures(rig(), count, seed).frames
+
+
+FINE_NOISE_PX = 0.04
+SURVEY_MM = 0.05
+
+
+def cube(beads: int = 64, side: float = 150.0) -> Phantom:
+    """Return a cube of beads at random."""
+    xyz = np.random.default_rng(3).uniform(-side / 2, side / 2, (beads, 3))
+    return Phantom(np.arange(1, beads + 1), xyz, np.full(beads, SURVEY_MM))
+
+
+def sheet() -> Phantom:
+    """Return a perforated sheet."""
+    drawn = Drawing(23, 23, pitch_mm=(14.0, 14.0, 14.0), sd_mm=SURVEY_MM).phantom()
+    return replace(drawn, xyz_mm=drawn.xyz_mm - drawn.xyz_mm.mean(axis=0))
+
+
+@functools.cache
+def sheet_and_cube() -> tuple[dict[str, list[Frame]], Phantom]:
+    """Return exposures 0 of a cube and 1 of a sheet in front of each detector, no pair."""
+    rng = np.random.default_rng(7)
+    phantom = cube().with_part(sheet())
+    true = [part.xyz_mm + rng.normal(0, SURVEY_MM, part.xyz_mm.shape) for part in phantom.parts()]
+    turn = matrix_from_vector([0.4, -0.3, 0.5])
+    frames = {}
+    for fluoroscope in rig().fluoroscopes:
+        frames[fluoroscope.name] = []
+        shown = [(turn, np.zeros(3)), facing(fluoroscope, rng, 0.5, 300.0, 5.0)]
+        for number, (part, xyz, (rotation, shift)) in enumerate(zip(phantom.parts(), true, shown)):
+            uv = fluoroscope.distortion.distort(fluoroscope.ideal(xyz @ rotation.T + shift))
+            inside = ((uv > 10) & (uv < 1013)).all(axis=1)
+            uv = uv[inside] + rng.normal(0, FINE_NOISE_PX, (inside.sum(), 2))
+            sigma = np.full(len(uv), FINE_NOISE_PX)
+            frame = Frame(
+                fluoroscope.name, number, part.target_id[inside], uv, (1024, 1024), sigma
+            )
+            frames[fluoroscope.name].append(frame)
+    return frames, phantom
 
 
 def calibrated(name='a', count=15, **options):

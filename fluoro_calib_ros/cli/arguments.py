@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..bodies.body import Body
     from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..exposures.angles import AngleOptions
+    from ..exposures.phantom import Phantom
     from ..io.formats.content import FileSettings
     from ..jobs.scheduling import Cluster
     from ..jobs.sources import BagSelection, Recording, Survey
@@ -249,7 +250,11 @@ def read_calibrated_exposures(
     survey = read_survey(arguments.phantom, file_settings(arguments, names=stored_names))
     recording, calibrations = read_calibrated_source(
         directory=arguments.calibration,
-        **source_of(arguments, bag_selection(arguments), names=survey.names),
+        **source_of(
+            arguments,
+            bag_selection(arguments, phantom=survey.phantom),
+            names=survey.names,
+        ),
     )
     print_inputs(arguments.source, survey, recording)
     return survey, recording, calibrations
@@ -378,8 +383,10 @@ def angle_options(arguments: argparse.Namespace) -> AngleOptions:
     )
 
 
-def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSelection:
-    """Return the selection added by `add_bag_options`."""
+def bag_selection(
+    arguments: argparse.Namespace, pairing: bool = True, phantom: Phantom | None = None
+) -> BagSelection:
+    """Return the selection added by `add_bag_options`, from frames of a phantom if it is given."""
     from ..jobs.sources import BagSelection
 
     return BagSelection(
@@ -388,6 +395,7 @@ def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSel
         pair_by=arguments.pair_by if pairing else 'frame_number',
         tolerance_s=arguments.pair_tolerance,
         angles=angle_options(arguments),
+        phantom=phantom,
     )
 
 

@@ -258,7 +258,9 @@ def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
 
     if not contains_images(arguments.source):
         names = Names() if survey is None else survey.names
-        source = source_of(arguments, bag_selection(arguments), names=names)
+        phantom = None if survey is None else survey.phantom
+        selection = bag_selection(arguments, phantom=phantom)
+        source = source_of(arguments, selection, names=names)
         return read_source(collect=arguments.collect, **source)
     if survey is None:
         raise DataError(

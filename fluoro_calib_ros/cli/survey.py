@@ -99,7 +99,8 @@ def run(arguments: argparse.Namespace) -> None:
 
     check_output_file(arguments.out, input_paths(arguments))
     initial = read_survey(arguments.phantom, file_settings(arguments))
-    source = source_of(arguments, bag_selection(arguments), names=initial.names)
+    selection = bag_selection(arguments, phantom=initial.phantom)
+    source = source_of(arguments, selection, names=initial.names)
     recording = read_source(collect=arguments.collect, **source)
     print_inputs(arguments.source, initial, recording)
     request = SurveyRequest(

@@ -124,18 +124,22 @@ def _request(
     frames: Frames | None = None
     phantom = None
     settings = calibrated_settings(file_settings(arguments), arguments.directory, rig)
-    if arguments.source is not None:
-        source = source_of(arguments, BagSelection(angles=angle_options(arguments)))
-        recording = read_source(collect=arguments.collect, **{**source, 'settings': settings})
-        print_notes(recording.notes)
-        print_unpaired(arguments.source, recording.unpaired)
-        frames = recording.frames
     if arguments.phantom is not None:
         survey = read_survey(arguments.phantom, settings)
         print_notes(survey.notes)
         phantom = survey.phantom
     saved_phantom = arguments.directory / PHANTOM
-    if frames is not None and (phantom is not None or saved_phantom.exists()):
-        source_request = CalibrationRequest(frames, phantom or read_phantom(saved_phantom))
-        frames = without_unusable(source_request)[0].frames  # excluded as in `calibrate`
+    shown = phantom
+    if shown is None and saved_phantom.exists():
+        shown = read_phantom(saved_phantom)
+    if arguments.source is not None:
+        selection = BagSelection(angles=angle_options(arguments), phantom=shown)
+        source = source_of(arguments, selection)
+        recording = read_source(collect=arguments.collect, **{**source, 'settings': settings})
+        print_notes(recording.notes)
+        print_unpaired(arguments.source, recording.unpaired)
+        frames = recording.frames
+        if shown is not None:
+            # Excluded as in `calibrate`.
+            frames = without_unusable(CalibrationRequest(frames, shown))[0].frames
     return read_request(arguments.directory, calibrations, frames, phantom)

@@ -18,7 +18,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.network import MIN_RAYS
-from ..photogrammetry.plane_resection import is_flat
+from ..photogrammetry.plane_resection import orients
 from ..photogrammetry.precision import covariance_of_exteriors
 from ..photogrammetry.unknowns import (
     RIGID_SD_MM,
@@ -79,15 +79,6 @@ def paired_exposures(measured: Measured, b: int) -> NDArray[np.int64]:
         (row[0, number], j) for (f, number), j in row.items() if f == b and (0, number) in row
     ]
     return np.array(pairs, dtype=int).reshape(-1, 2)
-
-
-def orients(shown: NDArray[np.float64], targets: NDArray[np.float64]) -> bool:
-    """Return whether exposures of targets `shown` (k, 3) can show the orientation of a rig.
-
-    targets (n, 3): of all exposures. If there are targets in space, flat ones are those of a grid
-    that is placed in front of each detector in turn, and possibly without a mark.
-    """
-    return is_flat(targets) or not is_flat(shown)
 
 
 def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> NDArray[np.bool_]:

@@ -36,6 +36,7 @@ from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.noise import CERTAIN
+from ..photogrammetry.plane_resection import orients
 from ..photogrammetry.precision import (
     covariance_blocks,
     covariance_of_exteriors,
@@ -51,7 +52,7 @@ from ..photogrammetry.unknowns import (
     RelativePose,
     relative_poses,
 )
-from .constraints import derivatives_of_pairs, mean_of_pairs, orients, paired_exposures
+from .constraints import derivatives_of_pairs, mean_of_pairs, paired_exposures
 from .fixed_calibration import (
     fixed_corrections,
     network_of_calibrations,

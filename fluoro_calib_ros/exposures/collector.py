@@ -12,7 +12,7 @@ and cost computing time. Therefore they are replaced by their median, one exposu
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,13 @@ from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..options import option
 from .frame import Frame, Frames, cells_of
-from .pairing import CompletePairer, PairingOptions, RecordedPairing, recorded_exposures
+from .pairing import (
+    CompletePairer,
+    PairingOptions,
+    RecordedPairing,
+    never_alone,
+    recorded_exposures,
+)
 
 MIN_COMMON_TARGETS = 8  # two frames with fewer common targets cannot be compared
 MAX_RECENT = 1000  # maximum number of remembered pairs
@@ -80,10 +86,25 @@ class StillOptions:
     )
 
 
-class ExposureCollector:
-    """Exposures collected from paired frames.
+def displacement_of_pair(one: Pair, other: Pair) -> float:
+    """Return the largest displacement [px] of a fluoroscope between two exposures.
 
-    exposures: the collected pairs; coverage: covered part of the image by fluoroscope, which grows
+    It is infinite for exposures of different fluoroscopes.
+    """
+    if one.keys() != other.keys():
+        return np.inf
+    return max(displacement(frame, other[name]) for name, frame in one.items())
+
+
+def stamp_of(pair: Pair) -> int:
+    """Return the stamp [ns] of an exposure, that of its first fluoroscope."""
+    return next(iter(pair.values())).stamp_ns
+
+
+class ExposureCollector:
+    """Exposures collected from paired frames, and from frames that need no partner.
+
+    exposures: the collected ones; coverage: covered part of the image by fluoroscope, which grows
     with them.
     """
 
@@ -93,9 +114,7 @@ class ExposureCollector:
         self.exposures: list[Pair] = []
         self.coverage: dict[str, Coverage] = {}
         self._numbers: set[tuple[str, int]] = set()  # fluoroscopes and frame numbers of exposures
-        self._recent: deque[Pair] = deque(maxlen=MAX_RECENT)
-        self._streaming = False
-        self._single: Pair | None = None  # collected as a single shot, but may begin a stream
+        self._streams: dict[tuple[str, ...], _PoseStream] = {}  # by the fluoroscopes of exposures
 
     def offer(self, pair: Pair) -> str:
         """Collect a pair if the phantom stands still in a new pose.
@@ -104,39 +123,21 @@ class ExposureCollector:
         collected like a single shot, and discarded if the next ones show that the phantom moves.
         Pairs without a stamp are not collected.
         """
-        first_name = self.fluoroscopes[0]
-        stamp_ns = pair[first_name].stamp_ns
-        if not stamp_ns:
+        if not stamp_of(pair):
             return NO_STAMP
-        still_ns = self.still.still_time_s * 1e9
-        self._confirm_single(pair, still_ns)
-        window = [p for p in self._recent if 0 <= stamp_ns - p[first_name].stamp_ns <= still_ns]
-        max_displacement = max((self._displacement(pair, p) for p in window), default=0.0)
-        span = max((stamp_ns - p[first_name].stamp_ns for p in window), default=0)
-        self._update_streaming(stamp_ns, bool(window), still_ns)
-        self._recent.append(pair)
-        if max_displacement > self.still.still_px:
-            return 'the phantom moves'
-        if self._streaming and span < still_ns / 2:
-            return 'too few frames to decide whether the phantom stands still'
+        stream = self._streams.setdefault(tuple(pair), _PoseStream())
+        moved = stream.moved_single(pair, self.still)
+        if moved is not None:
+            self._discard(moved)
+        refusal, is_single = stream.refusal(pair, self.still)
+        if refusal:
+            return refusal
         for exposure in self.exposures:
-            if self._displacement(pair, exposure) < self.still.new_px:
+            if displacement_of_pair(pair, exposure) < self.still.new_px:
                 return 'this pose of the phantom is already collected'
         refusal = self.add(pair)
-        self._single = pair if not refusal and not window else None
+        stream.single = pair if not refusal and is_single else None
         return refusal
-
-    def _confirm_single(self, pair: Pair, still_ns: float) -> None:
-        """Discard the single shot if the next frames show that the phantom moved."""
-        single_shot = self._single
-        if single_shot is None:
-            return
-        first_name = self.fluoroscopes[0]
-        if not 0 <= pair[first_name].stamp_ns - single_shot[first_name].stamp_ns <= still_ns:
-            self._single = None
-        elif self._displacement(pair, single_shot) > self.still.still_px:
-            self._single = None
-            self._discard(single_shot)
 
     def _discard(self, pair: Pair) -> None:
         """Remove an exposure."""
@@ -145,34 +146,17 @@ class ExposureCollector:
         for exposure in kept:
             self.add(exposure)
 
-    def _displacement(self, one: Pair, other: Pair) -> float:
-        """Return the largest displacement [px] of all fluoroscopes between two pairs."""
-        return max(displacement(one[name], other[name]) for name in self.fluoroscopes)
-
-    def _update_streaming(self, now: int, follows: bool, still_ns: float) -> None:
-        """Update whether frames arrive as a stream.
-
-        A stream begins with the first frame that follows another one in time, and ends with a long
-        gap.
-        """
-        previous_ns = self._recent[-1][self.fluoroscopes[0]].stamp_ns if self._recent else None
-        if follows:
-            self._streaming = True
-        elif previous_ns is None or not 0 <= now - previous_ns <= MAX_GAP * still_ns:
-            self._streaming = False
-
     def add(self, pair: Pair) -> str:
         """Collect a pair unconditionally, unless one of its frame numbers is already collected.
 
         Returns '' if the pair was collected, otherwise the reason.
         """
-        numbers = {(name, pair[name].number) for name in self.fluoroscopes}
+        numbers = {(name, frame.number) for name, frame in pair.items()}
         if not numbers.isdisjoint(self._numbers):
             return f'frame {min(number for _, number in numbers)} is collected already'
         self.exposures.append(pair)
         self._numbers |= numbers
-        for name in self.fluoroscopes:
-            frame = pair[name]
+        for name, frame in pair.items():
             self.coverage.setdefault(name, Coverage(frame.image_size)).add(frame.uv)
         return ''
 
@@ -190,10 +174,61 @@ class ExposureCollector:
                     f'{", ".join(self.fluoroscopes)}'
                 )
         return {
-            name: [pair[name] for pair in self.exposures]
+            name: [pair[name] for pair in self.exposures if name in pair]
             for name in self.fluoroscopes
             if not wanted or name in wanted
         }
+
+
+class _PoseStream:
+    """Recent exposures of the same fluoroscopes."""
+
+    def __init__(self) -> None:
+        self._recent: deque[Pair] = deque(maxlen=MAX_RECENT)
+        self._is_streaming = False
+        self.single: Pair | None = None  # collected as a single shot, but may begin a stream
+
+    def moved_single(self, pair: Pair, still: StillOptions) -> Pair | None:
+        """Return the single shot if the next pair shows that the phantom moved, else None."""
+        single = self.single
+        if single is None:
+            return None
+        if not 0 <= stamp_of(pair) - stamp_of(single) <= still.still_time_s * 1e9:
+            self.single = None
+        elif displacement_of_pair(pair, single) > still.still_px:
+            self.single = None
+            return single
+        return None
+
+    def refusal(self, pair: Pair, still: StillOptions) -> tuple[str, bool]:
+        """Add a pair; return '' if the phantom stands still, otherwise the reason.
+
+        The second value tells whether the pair is a single shot.
+        """
+        still_ns = still.still_time_s * 1e9
+        stamp_ns = stamp_of(pair)
+        window = [p for p in self._recent if 0 <= stamp_ns - stamp_of(p) <= still_ns]
+        max_displacement = max((displacement_of_pair(pair, p) for p in window), default=0.0)
+        span = max((stamp_ns - stamp_of(p) for p in window), default=0)
+        self._update_streaming(stamp_ns, bool(window), still_ns)
+        self._recent.append(pair)
+        if max_displacement > still.still_px:
+            return 'the phantom moves', False
+        if self._is_streaming and span < still_ns / 2:
+            return 'too few frames to decide whether the phantom stands still', False
+        return '', not window
+
+    def _update_streaming(self, now: int, follows: bool, still_ns: float) -> None:
+        """Update whether frames arrive as a stream.
+
+        A stream begins with the first frame that follows another one in time, and ends with a long
+        gap.
+        """
+        previous_ns = stamp_of(self._recent[-1]) if self._recent else None
+        if follows:
+            self._is_streaming = True
+        elif previous_ns is None or not 0 <= now - previous_ns <= MAX_GAP * still_ns:
+            self._is_streaming = False
 
 
 class RadiographCollector:
@@ -221,7 +256,7 @@ class RadiographCollector:
         pairs = tuple(exposures)
         for name, recent in self._recent.items():
             previous = self._wanted[name]
-            stamps = [pair[name].stamp_ns for pair in pairs]
+            stamps = [pair[name].stamp_ns for pair in pairs if name in pair]
             self._wanted[name] = {t: previous.get(t) or recent.pop(t, b'') for t in stamps}
 
     def of(self, frames: Frames) -> dict[str, dict[int, bytes]]:
@@ -241,6 +276,7 @@ def collect_recorded(
     mode: str = 'auto',
     pair_by: str = 'frame_number',
     tolerance_s: float = PairingOptions.tolerance_s,
+    alone: Callable[[Frame], bool] = never_alone,
 ) -> tuple[dict[str, list[Frame]], dict[str, int]]:
     """Collect the exposures of a recording in the same way as the calibration node.
 
@@ -254,6 +290,8 @@ def collect_recorded(
     pair_by : {'frame_number', 'stamp'}
     tolerance_s : float
         Largest difference between the stamps of an exposure [s].
+    alone : callable
+        Whether a frame needs no partner.
 
     Returns
     -------
@@ -271,7 +309,7 @@ def collect_recorded(
     if mode == 'still' and recorded and not any(frame.stamp_ns for frame in recorded):
         raise DataError(f'{NO_STAMP}: collect all')
     still_options = StillOptions()
-    pairer = CompletePairer(frames, RecordedPairing(pair_by, tolerance_s).unlimited())
+    pairer = CompletePairer(frames, RecordedPairing(pair_by, tolerance_s).unlimited(), alone=alone)
     collector = ExposureCollector(frames, still_options)
     if mode == 'auto':
         mode = 'still' if any(_is_stream(f, still_options) for f in frames.values()) else 'all'

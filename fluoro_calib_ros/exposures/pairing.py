@@ -3,8 +3,8 @@
 
 """Pairing: combine the frames of several fluoroscopes that belong to one exposure.
 
-A calibration needs all views of an exposure (CompletePairer). For a reconstruction, two views of
-three or more suffice (PartialPairer).
+A calibration needs all views of an exposure (CompletePairer), except of a sheet that is placed in
+front of one fluoroscope. For a reconstruction, two views of three or more suffice (PartialPairer).
 
 Streams arrive in order. Therefore a fluoroscope that has delivered a later frame has lost the
 earlier one, which is no longer waited for. Only a silent fluoroscope makes the others wait, for a
@@ -16,7 +16,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from bisect import bisect_left, insort
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, Protocol
@@ -224,6 +224,11 @@ class Pairer(ABC):
         return {name: replace(frame, number=self._exposures) for name, frame in exposure.items()}
 
 
+def never_alone(frame: object) -> bool:
+    """Return that a frame is no exposure without its partners."""
+    return False
+
+
 class CompletePairer(Pairer):
     """Pairer of exposures with a frame of every fluoroscope.
 
@@ -235,7 +240,8 @@ class CompletePairer(Pairer):
     ones. Raises ValueError for an unknown pair_by.
 
     once: whether a frame that is received again, as when two nodes publish the same stream, counts
-    as late, instead of making another exposure.
+    as late, instead of making another exposure. alone: whether a frame needs no partner; such a
+    frame is an exposure of its own.
     """
 
     def __init__(
@@ -243,8 +249,10 @@ class CompletePairer(Pairer):
         fluoroscopes: Iterable[str],
         options: PairingOptions | None = None,
         once: bool = False,
+        alone: Callable[[Any], bool] = never_alone,
     ) -> None:
         super().__init__(fluoroscopes, options)
+        self._is_alone = alone
         self._waiting: dict[str, OrderedDict[int, Any]] = {
             name: OrderedDict() for name in self.fluoroscopes
         }
@@ -260,6 +268,8 @@ class CompletePairer(Pairer):
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
         """Add a frame; return the exposure that it completes, if any."""
         name = frame.fluoroscope
+        if self._is_alone(frame):
+            return (self._counted({name: frame}),)
         waiting = self._waiting[name]
         key = self._key(frame)
         order = self._order(frame)

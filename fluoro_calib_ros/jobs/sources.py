@@ -40,6 +40,7 @@ from ..io.observations import (
     points_of_frames,
     read_points,
 )
+from ..photogrammetry.plane_resection import frames_without_partner
 from ..photogrammetry.rig_orientation import KnownOrientation
 
 if TYPE_CHECKING:
@@ -94,6 +95,7 @@ class BagSelection:
     tolerance_s: float = PairingOptions.tolerance_s
     #: joint that gives the angle of the C-arm
     angles: AngleOptions = field(default_factory=AngleOptions)
+    phantom: Phantom | None = None  #: what the frames show; frames of its sheets need no partner
 
     def check_file(self, path: object) -> None:
         """Raise DataError if the selection needs the times that a file does not have."""
@@ -266,7 +268,11 @@ def read_source(
         disagreement = disagreement_of_recording(frames)
         notes = (*notes, disagreement.at(path).sentence) if disagreement else notes
     collected = collect_recorded(
-        frames, collect or 'all', selection.pair_by, tolerance_s=selection.tolerance_s
+        frames,
+        collect or 'all',
+        selection.pair_by,
+        tolerance_s=selection.tolerance_s,
+        alone=frames_without_partner(selection.phantom),
     )
     return with_decisions(Recording(*collected, names, notes), settings.decisions)
 

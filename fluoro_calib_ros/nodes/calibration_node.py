@@ -28,18 +28,17 @@ from sensor_msgs.msg import CompressedImage
 from ..exposures.stamps import nanoseconds_from_stamp
 from .angle_input import AngleInput
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
-from .calibration_services import OrientationService, SelfCalibration
+from .calibration_services import SelfCalibration
 from .calibration_settings import (
     PARAMETERS,
     CalibrationFiles,
     CalibrationSettings,
     read_rig,
 )
+from .capture_services import CollectServices, NodeParts, OrientationService
 from .exposure_input import (
     RADIOGRAPH,
-    CollectServices,
     ExposureInput,
-    NodeParts,
     PhantomStream,
 )
 from .frame_validation import subscribe_frames

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Jobs of a calibration node: orient the rig and self-calibrate."""
+"""Job of a calibration node: self-calibrate the fluoroscopes."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from fluoro_calib_msgs.action import SelfCalibrate
-from fluoro_calib_msgs.srv import Calibrate, Orient
+from fluoro_calib_msgs.srv import Calibrate
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import CallbackGroup
 from rclpy.task import Future
@@ -20,15 +20,13 @@ from rclpy.task import Future
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..estimation.rounds import Round
-from ..exposures.frame import Frame
-from ..findings import Severity, sentences
-from ..io.calibration import Verdict, save_orientation
+from ..findings import Severity
+from ..io.calibration import Verdict
 from ..io.folder import check_output_folder
 from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
-from ..jobs.orientation import OrientationOutcome, orient
-from ..jobs.result_folder import RESULT_FOLDER, belongs_to
+from ..jobs.result_folder import RESULT_FOLDER
 from ..processes import in_worker_process
-from .exposure_input import NodeParts, RigServices
+from .capture_services import NodeParts, RigServices
 from .messages.self_calibration import (
     Request,
     Result,
@@ -37,89 +35,7 @@ from .messages.self_calibration import (
     fill_verdict,
     options_of_request,
 )
-from .runtime.services import Cancelled, ServiceEntry, check_timeout, in_thread, within
-
-
-class OrientationService(RigServices):
-    """The service orient, which orients the rig from the next frames of the phantom."""
-
-    def __init__(self, parts: NodeParts) -> None:
-        super().__init__(parts)
-        self._is_capturing = False
-        self.services = (ServiceEntry('orient', Orient, self._on_orient),)
-
-    async def _on_orient(
-        self, request: Orient.Request, response: Orient.Response
-    ) -> Orient.Response:
-        """Orient the rig, save the orientation and publish it."""
-        try:
-            with self._requests.one():
-                outcome = await self._orient(request)
-            orientation = outcome.orientation
-            save_orientation(self._rig.directory, orientation)
-        except (DataError, ValueError, OSError) as error:
-            response.message = f'the orientation of the rig is unchanged: {error}'
-            self._logger.error(response.message)
-            return response
-        self._output.publish_orientation(orientation)
-        response.success = True
-        response.orientation_id = orientation.orientation_id
-        response.message = (
-            f'{", ".join(orientation.fluoroscopes)} oriented in frame {orientation.frame_id} from '
-            f'{orientation.exposures} captures of the phantom, standard deviation of the sources '
-            f'{orientation.sd_mm.max():.2f} mm or less'
-        )
-        response.message = '; '.join([response.message, *sentences(outcome.findings)])
-        if outcome.findings:
-            self._logger.warning(response.message)
-        else:
-            self._logger.info(response.message)
-        return response
-
-    async def _orient(self, request: Orient.Request) -> OrientationOutcome:
-        """Capture frames and orient the rig. Raises DataError and ValueError."""
-        names = self._rig.names
-        phantom = self._rig.required_phantom()
-        settings = self._rig.settings().node
-        timeout = request.timeout_sec or settings.capture_timeout
-        check_timeout(timeout)
-        most = self._rig.settings().limits.max_exposures
-        if request.frames > most:
-            raise DataError(f'frames must be at most {most} (max_exposures), not {request.frames}')
-        self._node.check_active()
-        self._output.all_calibrations()
-        frames = await self._captured(names, request.frames or 1, timeout)
-        calibrations = self._output.calibrations
-        present_orientation = self._output.orientation
-        future, _ = in_thread(
-            self._node,
-            lambda: orient(
-                frames, phantom, calibrations, settings.rig_frame, present=present_orientation
-            ),
-        )
-        outcome = await future
-        if not belongs_to(outcome.orientation, self._output.calibrations):
-            raise DataError('the calibrations have changed meanwhile, capture the phantom again')
-        return outcome
-
-    async def _captured(
-        self, names: Sequence[str], count: int, timeout_s: float
-    ) -> dict[str, list[Frame]]:
-        """Return the next frames of all fluoroscopes. Raises DataError if time runs out."""
-        if self._is_capturing:
-            raise DataError('another capture is waiting for its frames')
-        self._is_capturing = True
-        wait = self._exposures.next_pairs(count)
-        try:
-            await within(self._node, timeout_s, wait.done, lambda: self._exposures.give_up(wait))
-        finally:
-            self._is_capturing = False
-        if len(wait.pairs) == count:
-            return {name: [pair[name] for pair in wait.pairs] for name in names}
-        raise DataError(
-            f'{len(wait.pairs)} of {count} frames of all fluoroscopes ({", ".join(names)}) came '
-            f'within {timeout_s:g} s'
-        )
+from .runtime.services import Cancelled, ServiceEntry
 
 
 class Job(RigServices, ABC):

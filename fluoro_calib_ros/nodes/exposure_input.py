@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from fluoro_calib_msgs.msg import CalibrationStatus
-from fluoro_calib_msgs.srv import Capture, Reset
-from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage
 
@@ -25,24 +23,14 @@ from ..exposures.phantom import Phantom
 from ..exposures.stamps import nanoseconds_from_stamp
 from ..images.codec import JPEG_START
 from ..limits import MEGABYTE
-from .calibration_output import CalibrationOutput
+from ..photogrammetry.plane_resection import frames_without_partner
 from .calibration_settings import (
-    CalibrationFiles,
     CalibrationSettings,
-    RigSetup,
 )
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.status import Collected
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
-from .runtime.lifecycle import Stream, StreamNode
-from .runtime.services import (
-    Requests,
-    ServiceEntry,
-    Worker,
-    check_timeout,
-    telling_service,
-    within,
-)
+from .runtime.lifecycle import Stream
 
 
 @dataclass
@@ -56,13 +44,31 @@ class PhantomStream(Stream):
 
 @dataclass(eq=False)
 class PairWait:
-    """Wait for pairs of frames, which ends if there are enough or if it is given up."""
+    """Wait for frames of all fluoroscopes, which ends if there are enough or if it is given up.
+
+    Pairs contain a frame of every fluoroscope; those of collected exposures may be of one, if it
+    needs no partner.
+    """
 
     count: int
     collected: bool = False  #: whether it is for pairs that become exposures
     pairs: list[Mapping[str, Frame]] = field(default_factory=list)
-    exposures: int = 0  #: number of exposures with the last pair
+    exposures: int = 0  #: number with the last pair, of the fluoroscope that has the fewest
+    passed: int = 0  #: frames of fluoroscopes that had enough, while others had none
     done: Future = field(default_factory=Future)
+
+    def has_enough(self, name: str) -> bool:
+        """Return whether there are enough frames of a fluoroscope."""
+        return sum(name in pair for pair in self.pairs) >= self.count
+
+
+def captured_frames(wait: PairWait, names: Sequence[str]) -> str:
+    """Return the numbers of the captured frames, of single ones with their fluoroscope."""
+    first = next(iter(wait.pairs[0].values()))
+    if len(wait.pairs[0]) == len(names):
+        return f'frame {first.number}'
+    frames = [frame for pair in wait.pairs for frame in pair.values()]
+    return ', '.join(f'frame {frame.number} of {frame.fluoroscope}' for frame in frames)
 
 
 RADIOGRAPH = 'radiograph'
@@ -113,7 +119,8 @@ class ExposureInput:
         self._start()
 
     def _start(self) -> None:
-        self._pairer = CompletePairer(self._names, self._settings.pairing)
+        alone = frames_without_partner(self._phantom)
+        self._pairer = CompletePairer(self._names, self._settings.pairing, alone=alone)
         self._collector = ExposureCollector(self._names, self._settings.still)
         self._radiographs = RadiographCollector(self._names)
 
@@ -151,19 +158,19 @@ class ExposureInput:
         """Return a summary of the data collected for a fluoroscope."""
         stream = self.streams[name]
         with self._lock:
-            exposures = self._collector.exposures
+            frames = self._collector.frames([name])[name]
             coverage = self._collector.coverage.get(name)
             status = CalibrationStatus(
                 fluoroscope=name,
                 frames_received=stream.received,
                 frames_rejected=stream.refusals.total + stream.refusals.failures,
                 frames_unpaired=self._pairer.unpaired[name],
-                exposures=len(exposures),
-                observations=sum(len(pair[name].target_id) for pair in exposures),
+                exposures=len(frames),
+                observations=sum(len(frame.target_id) for frame in frames),
                 coverage=coverage.fraction if coverage else 0.0,
             )
             covered = coverage.covered if coverage else None
-            ready = readiness(len(exposures), coverage)
+            ready = readiness(len(frames), coverage)
             return Collected(status, covered, stream.image_size, ready)
 
     def disagreement(self) -> str:
@@ -194,11 +201,14 @@ class ExposureInput:
     def _give(self, pair: Mapping[str, Frame], wait: PairWait) -> None:
         """Give a pair to a wait, which ends with its last one."""
         wait.pairs.append(pair)
-        wait.exposures = len(self._collector.exposures)
-        if len(wait.pairs) == wait.count:
-            self._waits.remove(wait)
-            wait.done.set_result(None)
-            self._on_captured()
+        wait.exposures = min(map(len, self._collector.frames().values()))
+        if all(map(wait.has_enough, self._names)):
+            self._end(wait)
+
+    def _end(self, wait: PairWait) -> None:
+        self._waits.remove(wait)
+        wait.done.set_result(None)
+        self._on_captured()
 
     # -- the thread of the streams
 
@@ -263,8 +273,9 @@ class ExposureInput:
     def _collect(self, pair: Mapping[str, Frame]) -> None:
         """Collect a pair for the oldest capture, or because the phantom stands still."""
         captures = [wait for wait in self._waits if wait.collected]
-        for wait in [wait for wait in self._waits if not wait.collected]:
-            self._give(pair, wait)
+        if len(pair) == len(self._names):
+            for wait in [wait for wait in self._waits if not wait.collected]:
+                self._give(pair, wait)
         collector = self._collector
         if len(collector.exposures) >= self._settings.limits.max_exposures:
             # Each new exposure is compared with all others.
@@ -274,6 +285,11 @@ class ExposureInput:
             )
             self._limited_logger.warning(self.capture_refusal)
             return
+        if captures and all(map(captures[0].has_enough, pair)):
+            captures[0].passed += 1
+            if captures[0].passed >= self._settings.pairing.waiting:
+                self._end(captures[0])  # the others show no phantom
+            return
         if captures:
             refusal = self.capture_refusal = collector.add(pair)
             if not refusal:
@@ -281,7 +297,7 @@ class ExposureInput:
         elif self._settings.node.collect == 'still':
             before = len(collector.exposures)
             refusal = collector.offer(pair)
-            first = pair[self._names[0]]
+            first = next(iter(pair.values()))
             if not first.stamp_ns:
                 self.streams[first.fluoroscope].refusals.note(
                     f'fluoroscope {first.fluoroscope}: {refusal}; use the service capture'
@@ -296,102 +312,15 @@ class ExposureInput:
             self._log_collected(pair)
 
     def _log_collected(self, pair: Mapping[str, Frame]) -> None:
+        coverage = self._collector.coverage
         counts = ', '.join(
-            f'{name}: {len(pair[name].target_id)} targets, '
-            f'{100 * coverage.fraction:.0f} % of the image covered'
-            for name, coverage in self._collector.coverage.items()
+            f'{name}: {len(frame.target_id)} targets, '
+            f'{100 * coverage[name].fraction:.0f} % of the image covered'
+            for name, frame in pair.items()
         )
-        exposures = len(self._collector.exposures)
-        self._logger.info(f'exposure {exposures} collected ({counts})')
+        self._logger.info(f'exposure {len(self._collector.exposures)} collected ({counts})')
         advice = '; '.join(
-            f'{name}: {readiness(exposures, coverage).advice}'
-            for name, coverage in self._collector.coverage.items()
+            f'{name}: {readiness(len(frames), coverage.get(name)).advice}'
+            for name, frames in self._collector.frames().items()
         )
         self._logger.info(f'next pose: {advice}')
-
-
-@dataclass(frozen=True)
-class NodeParts:
-    """Parts of a calibration node that its services use."""
-
-    node: StreamNode
-    rig: RigSetup
-    exposures: ExposureInput
-    output: CalibrationOutput
-    files: CalibrationFiles
-    requests: Requests
-
-
-class RigServices(Worker):
-    """Services of a calibration node, listed in `services`."""
-
-    services: tuple[ServiceEntry, ...]
-
-    def __init__(self, parts: NodeParts) -> None:
-        super().__init__(parts.node)
-        self._node, self._rig, self._exposures = parts.node, parts.rig, parts.exposures
-        self._output, self._files, self._requests = parts.output, parts.files, parts.requests
-        self._logger = parts.node.get_logger()
-
-
-class CollectServices(RigServices):
-    """The services capture, reset and collect_anew."""
-
-    def __init__(self, parts: NodeParts) -> None:
-        super().__init__(parts)
-        self.services = (
-            ServiceEntry('capture', Capture, self._on_capture),
-            telling_service('reset', Reset, 'not reset', self._reset, self._logger),
-            telling_service('collect_anew', Reset, 'not reset', self._anew, self._logger),
-        )
-
-    async def _on_capture(
-        self, request: Capture.Request, response: Capture.Response
-    ) -> Capture.Response:
-        timeout = request.timeout_sec or self._rig.settings().node.capture_timeout
-        try:
-            self._check(timeout)
-        except ValueError as error:  # including DataError
-            response.message = str(error)
-            return response
-        wait = self._exposures.next_pairs(collected=True)
-        with self._requests.one():
-            await within(self._node, timeout, wait.done, lambda: self._exposures.give_up(wait))
-        names = self._rig.names
-        response.success = bool(wait.pairs)
-        response.exposures = wait.exposures
-        if wait.pairs:
-            first = wait.pairs[0][names[0]]
-            response.message = f'frame {first.number} captured, {response.exposures} exposures now'
-        else:
-            response.exposures = self._exposures.collected(names[0]).status.exposures
-            streams = self._exposures.streams.values()
-            received = ', '.join(f'{stream.name} {stream.received}' for stream in streams)
-            response.message = self._exposures.capture_refusal or (
-                f'no frame of all fluoroscopes ({", ".join(names)}) came within {timeout:g} s; '
-                f'frames received: {received}'
-            )
-        return response
-
-    def _check(self, timeout_s: float) -> None:
-        """Raise ValueError (including DataError) if nothing can be captured."""
-        self._rig.required_phantom()
-        check_timeout(timeout_s)
-        self._node.check_active()
-        waiting = self._requests.waiting
-        if waiting >= self._rig.settings().limits.max_waiting:
-            raise DataError(
-                f'{waiting} requests wait for their answers, as many as max_waiting allows'
-            )
-
-    def _reset(self, _: Reset.Request) -> str:
-        count = self._exposures.reset()
-        self._output.refused.clear()
-        return f'{count} exposures discarded, the calibration stays in use'
-
-    def _anew(self, request: Reset.Request) -> str:
-        self._node.set_parameters([Parameter('collect', value='still')])
-        return (
-            f'{self._reset(request)}; new exposures are collected whenever the phantom stands '
-            'still in a new pose'
-        )

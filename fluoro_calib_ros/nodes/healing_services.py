@@ -34,7 +34,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import in_worker_process
 from .calibration_services import Job
 from .calibration_settings import MAX_HEAL_S, check_folders
-from .exposure_input import NodeParts
+from .capture_services import NodeParts
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.self_calibration import fill_healing
 from .runtime.services import telling_service, wake, within

@@ -24,7 +24,7 @@ from ..jobs.learning import DRIFTED, learn_shapes, learned_for
 from ..jobs.result_folder import belongs_to
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import in_worker_process
-from .exposure_input import NodeParts, RigServices
+from .capture_services import NodeParts, RigServices
 from .healing_services import MarkerCollection
 from .messages.observations import ObservedFrame
 from .runtime.diagnostics import OK, WARN, Health, Status

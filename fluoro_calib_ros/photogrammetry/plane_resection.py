@@ -15,13 +15,16 @@ Anal. Mach. Intell. 28, 2006).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
+from ..exposures.frame import Frame
+from ..exposures.pairing import never_alone
+from ..exposures.phantom import Phantom
 from .resection import MIN_FLATNESS
 
 # Smallest singular value of the conditions on the principal distance, over its largest possible
@@ -51,6 +54,28 @@ def flatness(xyz: NDArray[np.float64]) -> float:
 def is_flat(xyz: NDArray[np.float64]) -> bool:
     """Return whether targets (n, 3) nearly lie in a plane."""
     return len(xyz) < 4 or flatness(xyz) < MIN_FLATNESS
+
+
+def orients(shown: NDArray[np.float64], targets: NDArray[np.float64]) -> bool:
+    """Return whether exposures of targets `shown` (k, 3) can show the orientation of a rig.
+
+    targets (n, 3): of all exposures. If there are targets in space, flat ones are those of a grid
+    that is placed in front of each detector in turn, and possibly without a mark.
+    """
+    return is_flat(targets) or not is_flat(shown)
+
+
+def frames_without_partner(phantom: Phantom | None) -> Callable[[Frame], bool]:
+    """Return a function that tells whether a frame is an exposure without its partners.
+
+    It shows nothing but flat parts of a phantom that has others in space: `orients` does not hold.
+    """
+    parts = [] if phantom is None else phantom.parts()
+    flat = [is_flat(part.xyz_mm) for part in parts]
+    if all(flat) or not any(flat):
+        return never_alone
+    ids = np.concatenate([part.target_id for part, is_part in zip(parts, flat) if is_part])
+    return lambda frame: bool(np.isin(frame.target_id, ids).all())
 
 
 def plane_of(xyz: NDArray[np.float64]) -> Plane:

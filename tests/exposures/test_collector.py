@@ -289,6 +289,22 @@ def test_unpaired_frames_are_left_out_and_counted():
     assert unpaired == {'a': 1, 'b': 1}
 
 
+@pytest.mark.parametrize('by', ['frame_number', 'stamp'])
+def test_frames_that_need_no_partner_are_exposures(by):
+    recorded = {
+        'a': [frame('a', n, 500.0 * n, ids=range(20 if n < 3 else 50, 70)) for n in (1, 2, 3, 5)],
+        'b': [frame('b', n, 500.0 * n, ids=range(20 if n < 3 else 50, 70)) for n in (2, 4, 6)],
+    }
+    frames, unpaired = collect_recorded(
+        recorded, pair_by=by, alone=lambda frame: min(frame.target_id) == 50
+    )
+    assert [f.stamp_ns // 500_000_000 for f in frames['a']] == [2, 3, 5]
+    assert [f.stamp_ns // 500_000_000 for f in frames['b']] == [2, 4, 6]
+    assert unpaired == {'a': 1, 'b': 0}
+    numbers = {name: [f.number for f in view] for name, view in frames.items()}
+    assert set(numbers['a']) & set(numbers['b']) == {numbers['a'][0]} == {numbers['b'][0]}
+
+
 @pytest.mark.parametrize(('gap_ms', 'count'), [(10, 0), (10_000, 2)])
 def test_two_frames_are_exposures_unless_they_are_a_stream(gap_ms, count):
     """Nobody moves a phantom to another pose within the time for which it has to be still."""

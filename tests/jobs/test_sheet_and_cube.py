@@ -4,21 +4,19 @@
 """One image of a sheet before each detector, and one of a cube, calibrate a rig."""
 
 from dataclasses import replace
-from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 import rigs
-from rigs import kinds, refused
+from rigs import cube, kinds, refused, sheet
 
 from benchmarks.bead_images import bead_image
-from benchmarks.targets import facing
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
+from fluoro_calib_ros.exposures.phantom import Drawing
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images.lattice import NOT_MARKED
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
@@ -27,19 +25,6 @@ from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_exposure
-
-NOISE_PX = 0.04
-SURVEY_MM = 0.05
-
-
-def cube(beads: int = 64, side: float = 150.0) -> Phantom:
-    xyz = np.random.default_rng(3).uniform(-side / 2, side / 2, (beads, 3))
-    return Phantom(np.arange(1, beads + 1), xyz, np.full(beads, SURVEY_MM))
-
-
-def sheet() -> Phantom:
-    drawn = Drawing(23, 23, pitch_mm=(14.0, 14.0, 14.0), sd_mm=SURVEY_MM).phantom()
-    return replace(drawn, xyz_mm=drawn.xyz_mm - drawn.xyz_mm.mean(axis=0))
 
 
 def test_parts_have_ids_of_their_own_and_are_read_as_written(tmp_path):
@@ -65,32 +50,9 @@ def test_a_part_needs_targets(part):
         replace(cube(8), part=np.array(part))
 
 
-@cache
-def exposures() -> tuple[dict[str, list[Frame]], Phantom]:
-    """Return two exposures of each fluoroscope; those of the sheet are no pair."""
-    rng = np.random.default_rng(7)
-    phantom = cube().with_part(sheet())
-    true = [part.xyz_mm + rng.normal(0, SURVEY_MM, part.xyz_mm.shape) for part in phantom.parts()]
-    turn = matrix_from_vector([0.4, -0.3, 0.5])
-    frames = {}
-    for fluoroscope in rigs.rig().fluoroscopes:
-        frames[fluoroscope.name] = []
-        shown = [(turn, np.zeros(3)), facing(fluoroscope, rng, 0.5, 300.0, 5.0)]
-        for number, (part, xyz, (rotation, shift)) in enumerate(zip(phantom.parts(), true, shown)):
-            uv = fluoroscope.distortion.distort(fluoroscope.ideal(xyz @ rotation.T + shift))
-            inside = ((uv > 10) & (uv < 1013)).all(axis=1)
-            uv = uv[inside] + rng.normal(0, NOISE_PX, (inside.sum(), 2))
-            sigma = np.full(len(uv), NOISE_PX)
-            frame = Frame(
-                fluoroscope.name, number, part.target_id[inside], uv, (1024, 1024), sigma
-            )
-            frames[fluoroscope.name].append(frame)
-    return frames, phantom
-
-
 @pytest.mark.long
 def test_a_sheet_and_a_cube_give_corrections_and_orientation():
-    frames, phantom = exposures()
+    frames, phantom = rigs.sheet_and_cube()
     outcome = run_calibration(CalibrationRequest(frames, phantom), validate=True)
     assert outcome.result.converged
     assert outcome.validation.verdict == 'cannot tell'
@@ -101,7 +63,7 @@ def test_a_sheet_and_a_cube_give_corrections_and_orientation():
     assert outcome.orientation.exposures == 1
     for calibration in outcome.result.calibrations.values():
         # Nothing tells the noise from the errors of targets that are seen once.
-        assert NOISE_PX / 2 < calibration.image_sd < 4 * NOISE_PX
+        assert rigs.FINE_NOISE_PX / 2 < calibration.image_sd < 4 * rigs.FINE_NOISE_PX
     assert shape_error_mm(outcome.result.calibrations, outcome.orientation) < 0.2
 
 
@@ -112,7 +74,9 @@ def shape_error_mm(calibrations, orientation) -> float:
     for fluoroscope in rigs.rig().fluoroscopes:
         uv = fluoroscope.distortion.distort(fluoroscope.ideal(xyz))
         name = fluoroscope.name
-        frames[name] = Frame(name, 1, np.arange(50), uv, (1024, 1024), np.full(50, NOISE_PX))
+        frames[name] = Frame(
+            name, 1, np.arange(50), uv, (1024, 1024), np.full(50, rigs.FINE_NOISE_PX)
+        )
     points = reconstruct_exposure(frames, calibrations, Intersector(orientation)).points
     found = points.xyz_mm[np.isfinite(points.xyz_mm).all(axis=1)]
     assert len(found) == 50
@@ -124,7 +88,7 @@ def shape_error_mm(calibrations, orientation) -> float:
 
 @pytest.mark.parametrize('which', [0, 1])
 def test_two_exposures_of_one_target_are_too_few(which):
-    frames, phantom = exposures()
+    frames, phantom = rigs.sheet_and_cube()
     (name, shown), *_ = frames.items()
     repeated = [shown[which], replace(shown[which], number=9, uv=shown[which].uv + 5.0)]
     with refused(Kind.FEW_EXPOSURES, exposures=2, needed=3):

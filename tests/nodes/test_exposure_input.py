@@ -11,7 +11,7 @@ import rigs
 
 from fluoro_calib_ros.exposures.collector import StillOptions
 from fluoro_calib_ros.exposures.pairing import PairingOptions
-from fluoro_calib_ros.nodes.exposure_input import ExposureInput
+from fluoro_calib_ros.nodes.exposure_input import ExposureInput, captured_frames
 from fluoro_calib_ros.nodes.messages.observations import ObservedFrame
 
 
@@ -113,3 +113,78 @@ def test_each_capture_has_the_number_of_exposures_with_its_own(exposures):
         for name in 'ab':
             exposures.add(name, observed(name, number, 0))
     assert [capture.exposures for capture in captures] == [1, 2, 3]
+
+
+@pytest.fixture
+def sheets(logger):
+    """Return the input of a node whose phantom is a cube with a sheet."""
+    settings = SimpleNamespace(
+        pairing=PairingOptions(waiting=3),
+        still=StillOptions(),
+        node=SimpleNamespace(collect='request'),
+        limits=SimpleNamespace(max_exposures=100),
+    )
+    return ExposureInput('ab', rigs.sheet_and_cube()[1], settings, lambda: None, logger)
+
+
+CUBE, SHEET = 0, 1
+
+
+def of_part(name, part, number):
+    """Return an exposure of a part as a message."""
+    frame = rigs.sheet_and_cube()[0][name][part]
+    return ObservedFrame(
+        number,
+        0,
+        f'{name}_optical',
+        number,
+        frame.image_size,
+        np.asarray(frame.target_id, np.uint32).tobytes(),
+        *frame.uv.T,
+        sigma=frame.sigma,
+        start=b'',
+    )
+
+
+def counts(exposures):
+    return [exposures.collected(name).status.exposures for name in 'ab']
+
+
+def test_a_sheet_needs_no_partner_but_a_cube_does(sheets):
+    sheets.use(
+        SimpleNamespace(**{**vars(sheets._settings), 'node': SimpleNamespace(collect='still')})
+    )
+    sheets.add('a', of_part('a', SHEET, 1))
+    assert counts(sheets) == [1, 0]
+    sheets.add('b', of_part('b', SHEET, 2))
+    assert counts(sheets) == [1, 1]
+    sheets.add('a', of_part('a', CUBE, 3))
+    assert counts(sheets) == [1, 1]
+    sheets.add('b', of_part('b', CUBE, 3))
+    assert counts(sheets) == [2, 2]
+    assert [frame.number for frame in sheets.frames()['b']] == [2, 3]
+    assert sheets.collected('a').status.frames_unpaired == 0
+
+
+def test_a_capture_of_sheets_takes_a_frame_of_each_fluoroscope(sheets):
+    capture = sheets.next_pairs(collected=True)
+    for number in (1, 2):
+        sheets.add('a', of_part('a', SHEET, number))
+    assert not capture.done.done()
+    sheets.add('b', of_part('b', SHEET, 2))
+    assert capture.done.done() and counts(sheets) == [1, 1] and capture.exposures == 1
+    assert captured_frames(capture, 'ab') == 'frame 1 of a, frame 2 of b'
+
+
+def test_a_capture_of_a_sheet_ends_if_the_other_fluoroscope_shows_none(sheets):
+    captures = [sheets.next_pairs(collected=True) for _ in range(2)]
+    orient = sheets.next_pairs()
+    for number in range(1, 5):
+        assert not captures[0].done.done()
+        sheets.add('a', of_part('a', SHEET, number))
+    assert captures[0].done.done() and counts(sheets) == [1, 0]
+    assert captured_frames(captures[0], 'ab') == 'frame 1 of a'
+    sheets.add('a', of_part('a', SHEET, 5))
+    sheets.give_up(captures[1])
+    assert captured_frames(captures[1], 'ab') == 'frame 5 of a'
+    assert not orient.pairs, 'a sheet does not orient the rig'

@@ -242,7 +242,7 @@ def test_exposures_are_limited():
     settings = SimpleNamespace(limits=SimpleNamespace(max_exposures=0))
     exposures = ExposureInput.__new__(ExposureInput)
     inner = Lines()
-    exposures._settings = settings
+    exposures._settings, exposures._names = settings, ('a',)
     exposures._collector = SimpleNamespace(exposures=[])
     exposures._limited_logger = RateLimitedLogger(PrintableLogger(inner))
     exposures._waits = []

@@ -24,11 +24,12 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.limits import CollectLimits
-from fluoro_calib_ros.nodes import calibration_input, calibration_services
+from fluoro_calib_ros.nodes import calibration_input, calibration_services, capture_services
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
 from fluoro_calib_ros.nodes.calibration_output import CalibrationOutput
-from fluoro_calib_ros.nodes.calibration_services import OrientationService, SelfCalibration
+from fluoro_calib_ros.nodes.calibration_services import SelfCalibration
 from fluoro_calib_ros.nodes.calibration_settings import CalibrationSettings, RigSetup
+from fluoro_calib_ros.nodes.capture_services import OrientationService
 from fluoro_calib_ros.nodes.exposure_input import PairWait
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     calibration_from_message,
@@ -359,7 +360,7 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
         output._in_use.update(new)
         return outcome
 
-    monkeypatch.setattr(calibration_services, 'in_thread', lambda *_: (recalibrated(), None))
+    monkeypatch.setattr(capture_services, 'in_thread', lambda *_: (recalibrated(), None))
     capture = service._orient(request)
     capture.send(None)  # the capture waits for its frames
     wait = service._exposures.wait

@@ -3,10 +3,15 @@
 
 """Collecting exposures: by capture or from a stationary phantom; pairing by number or by stamp."""
 
+import subprocess
 from dataclasses import replace
 
-from fluoro_calib_msgs.srv import Capture
-from ros_graph import NAMES, standing
+import rigs
+from fluoro_calib_msgs.srv import Calibrate, Capture
+from ros_graph import JOB_DEADLINE, NAMES, entry_point, standing
+
+from fluoro_calib_ros.io.bags.writer import write_bag
+from fluoro_calib_ros.io.phantom import write_phantom
 
 
 def pairs_of(exposures, i=0, count=10**6, **options):
@@ -138,3 +143,34 @@ def test_pairing_by_stamp(graph, exposures, tmp_path):
     client.publish(replace(b, stamp_ns=b.stamp_ns + 2_500_000))  # too far apart in time
     client.wait_for_status(lambda s: s.frames_received == 6)
     assert client.wait_for_status(lambda s: s.frames_received == 6, 'b').exposures == 5
+
+
+def test_a_sheet_in_front_of_each_detector_in_turn_calibrates_as_offline(graph, tmp_path):
+    """The other fluoroscope shows no phantom meanwhile; the cube is a pair."""
+    client = graph.client
+    shown, phantom = rigs.sheet_and_cube()
+    write_phantom(tmp_path / 'both.csv', phantom)
+    (cube_a, sheet_a), (cube_b, sheet_b) = (
+        [replace(frame, frame_id=f'{name}_optical') for frame in shown[name]] for name in NAMES
+    )
+    start_ns = 1_800_000_000 * 10**9
+    frames = [
+        replace(frame, number=number, stamp_ns=start_ns + number * 10**9)
+        for number, frame in enumerate([sheet_a, sheet_b], 1)
+    ]
+    frames += [replace(f, number=3, stamp_ns=start_ns + 3 * 10**9) for f in (cube_a, cube_b)]
+    graph.calibration_node(tmp_path / 'live', phantom=tmp_path / 'both.csv')
+    for frame in frames:
+        client.publish(frame)
+    for name in NAMES:
+        status = client.wait_for_status(lambda s: s.exposures == 2, name, 'both exposures')
+        assert status.frames_unpaired == 0
+    answer = client.call(Calibrate, 'calibrate')
+    assert answer.success, answer.message
+    write_bag(tmp_path / 'bag', {n: [f for f in frames if f.fluoroscope == n] for n in NAMES})
+    command = [*entry_point('cli'), 'calibrate', tmp_path / 'bag', '--out', tmp_path / 'offline']
+    command += ['--phantom', tmp_path / 'both.csv', '--fast']
+    subprocess.run(command, stdout=subprocess.DEVNULL, timeout=JOB_DEADLINE, check=True)
+    for file in ('interior.csv', 'targets.csv', 'residuals.csv'):
+        live, offline = (tmp_path / folder / file for folder in ('live', 'offline'))
+        assert live.read_bytes() == offline.read_bytes()

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .clipping import UNCLIPPED, Clipping
 from .light import Light
 from .shadow_fit import UNDISTURBED, Beads
 from .view import TAIL
@@ -68,15 +69,17 @@ class _Contrasts:
         return cls(float(line[0]), float(line[1]), median, float(np.sqrt(variance)) / spread)
 
 
-def black_level(beads: Beads, black: float) -> float:
+def black_level(beads: Beads, black: float, clipping: Clipping = UNCLIPPED) -> float:
     """Return the grey value at which beads would have no contrast.
 
     Beads absorb a share of the light, so that their contrast is proportional to it. If the grey
     values were windowed for display, it is proportional to their difference from another one; in
     a logarithmic image, it is the same everywhere. black: the grey value above which the light is
-    measured; it stays, if it is likely.
+    measured; it stays, if it is likely. Beads in light that clipped pixels hide show nothing of
+    it: if that light is wrong, their contrasts are wrong by as much.
     """
     good = beads.measured & (beads.light > 0) & (beads.misfit < UNDISTURBED)
+    good &= clipping.leaves(beads.light)
     line = _Contrasts.of(beads, good)
     if line is None or line.slope < -SURE_SDS * line.sd or abs(line.offset) < SURE_SDS * line.sd:
         return black

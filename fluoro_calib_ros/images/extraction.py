@@ -286,7 +286,8 @@ def _first_measured(
         )
         before = black
         if not is_sheet:
-            black = black_level(measured.beads, black)
+            clipping = detections.light.above(black).clipping
+            black = black_level(measured.beads, black, clipping)
         if black == before:
             break
         light = float(np.median(measured.beads.light))

@@ -43,6 +43,7 @@ START_MASK_PX = 3.0
 # four images with a mask of factor 1.5 and 3 px, and at most .15 in 41 images without one but in
 # one, whose profile was not the best.
 COMMON = 0.15
+FREE_OF_EDGES = 0.25  # share of windows without edges of plates, at least
 MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image
 # Largest lack of fit with a mask over that without one. It was .43 to .88 in seven images with a
 # mask whose parameters were found, and .98 in one where they were not.
@@ -254,6 +255,14 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     rows = _sampled(np.flatnonzero(alone), SAMPLE)
     if len(rows) < FEW:
         return imaging
+    wide = _profile_fit(
+        light, shadows.uv[rows], (shadows.shape[rows], size[rows]), imaging.profile, start.reach_px
+    )
+    disturbed = wide.misfit > DISTURBED * np.quantile(wide.misfit, FREE_OF_EDGES)
+    alone[rows[disturbed]] = False
+    rows = rows[~disturbed]
+    if len(rows) < FEW:
+        return imaging
     shapes = shadows.shape[rows], size[rows]
     fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)
     if light.clipping:  # the light that clipped pixels hide has not converged
@@ -267,8 +276,8 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         profile = _typical(
             light, isolated, imaging.size, start.radius_px, start=profile, estimated=estimated
         )
-    if profile.sharpening < MIN_SHARPENING:
-        profile = replace(profile, sharpening=0.0, mask_px=0.0)
+    if profile.sharpening < MIN_SHARPENING or not _is_inside(profile.mask_px, LIMITS['mask_px']):
+        return imaging
     plain, masked = (
         _lack(
             _profile_fit(
@@ -289,6 +298,12 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     )
     fit.run(STEPS)
     return replace(imaging, profile=profile, noise=noise_of_windows(fit))
+
+
+def _is_inside(value: float, limits: tuple[float, float]) -> bool:
+    """Return whether an estimated value is not at one of its limits, at which it has run away."""
+    low, high = limits
+    return low * (1 + RADIUS_SD) < value < high * (1 - RADIUS_SD)
 
 
 def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:

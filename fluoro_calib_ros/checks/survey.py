@@ -78,11 +78,14 @@ def displaced(beads: SurveyedBeads) -> Finding | None:
     )
 
 
-def check_survey(beads: SurveyedBeads) -> list[Check]:
+def check_survey(beads: SurveyedBeads, is_given: bool = True) -> list[Check]:
     """Return the checks of the geometry, the scale, the ids and the precision of a survey.
 
-    If the unit of the distances is wrong, nothing else in mm is checked.
+    If the unit of the distances is wrong, nothing else in mm is checked. is_given: whether
+    coordinates were given; else there is nothing to compare scale, ids and precision with.
     """
+    if not is_given:
+        return [_check_intersection(beads), _check_distances(beads, is_given)]
     wrong_unit = _wrong_unit(beads)
     if wrong_unit is not None:
         return [_check_intersection(beads), wrong_unit]
@@ -95,20 +98,33 @@ def check_survey(beads: SurveyedBeads) -> list[Check]:
     ]
 
 
-def trusted_scale(beads: SurveyedBeads) -> list[Finding]:
-    """Return a note on the error of all distances that nothing would show."""
-    if beads.scaled is None:
-        return []
-    unseen = OFF_SD * _given_scale_sd(beads)
+def taken_on_trust(beads: SurveyedBeads, is_given: bool = True) -> list[Finding]:
+    """Return notes on errors that nothing would show.
+
+    is_given: whether coordinates were given, with a scale.
+    """
+    unseen = OFF_SD * _given_scale_sd(beads) if is_given else np.inf
+    limit = f'if it is below {100 * unseen:.2f} %' if is_given else 'without given coordinates'
+    notes = []
+    if beads.scaled is not None:
+        notes.append(
+            'the scale is that of the measured distances: an error that they share, such as that '
+            f'of the caliper, is not seen {limit}'
+        )
+    if not is_given:
+        notes.append(
+            'images that are mirrored give the mirror image of the phantom: compare the order of '
+            'some beads with that on the phantom'
+        )
     return [
         Finding(
             Kind.TAKEN_ON_TRUST,
-            'the scale is that of the measured distances: an error that they share, such as that '
-            f'of the caliper, is not seen if it is below {100 * unseen:.2f} %',
+            note,
             Place(name=''),
             severity=Severity.NOTE,
             numbers={'scale': unseen},
         )
+        for note in notes
     ]
 
 
@@ -198,9 +214,12 @@ def _wrong_unit(beads: SurveyedBeads) -> Check | None:
     return None
 
 
-def _check_distances(beads: SurveyedBeads) -> Check:
+def _check_distances(beads: SurveyedBeads, is_given: bool = True) -> Check:
     numbers = {'scale': beads.scale, 'scale_sd': beads.scale_sd, 'distances': 0}
-    scale = f'the scale is {beads.scale:.6f} (sd {beads.scale_sd:.6f})'
+    scale = f'the scale is {beads.scale:.6f} (sd {beads.scale_sd:.6f}) times that of the given '
+    scale += 'coordinates'
+    if not is_given:
+        scale = f'the scale has a standard deviation of {beads.scale_sd:.6f}'
     advice = 'measure two distances or more between beads that are far apart, and give them'
     if beads.scaled is None:
         return Check(
@@ -214,7 +233,7 @@ def _check_distances(beads: SurveyedBeads) -> Check:
     if not beads.scaled.freedom:
         return Check(
             Kind.DISTANCES,
-            f'{scale} times that of the given coordinates, from one distance without a check',
+            f'{scale}, from one distance without a check',
             advice=advice,
             numbers=numbers,
         )
@@ -226,8 +245,8 @@ def _check_distances(beads: SurveyedBeads) -> Check:
     names = ' or '.join(distance.name for distance in named)
     return Check(
         Kind.DISTANCES,
-        f'{scale} times that of the given coordinates, from {len(ratio)} distances; the largest '
-        f'error, of {names}, is {abs(error):.3f} mm, {ratio[worst]:.1f} times its sd',
+        f'{scale}, from {len(ratio)} distances; the largest error, of {names}, is '
+        f'{abs(error):.3f} mm, {ratio[worst]:.1f} times its sd',
         Place(
             target_id=tuple(
                 end for distance in named for end in (distance.first, distance.second)

@@ -27,6 +27,7 @@ from .output import print_findings, print_result, print_round
 if TYPE_CHECKING:
     from ..estimation.survey import MeasuredDistance
     from ..exposures.names import Names
+    from ..jobs.sources import Survey
     from ..jobs.survey import SurveyOutcome
 
 NAME = 'survey'
@@ -58,8 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(
         source,
         'phantom',
+        required=False,
         help='approximate coordinates, to a few centimetres for a phantom of a few decimetres; '
-        'any phantom file, or one of the command phantom',
+        'any phantom file, or one of the command phantom (default: found from the image points, '
+        'with the ids that they have)',
     )
     add_collect(source)
     add_bag_options(parser)
@@ -92,21 +95,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Survey a phantom and write it. Raises DataError, also for the verdict 'fail'."""
     from ..estimation.options import CalibrationOptions
+    from ..exposures.names import Names
     from ..io.folder import check_output_file
     from ..io.phantom import write_phantom
     from ..jobs.sources import read_source, read_survey
     from ..jobs.survey import SurveyRequest, survey
 
     check_output_file(arguments.out, input_paths(arguments))
-    initial = read_survey(arguments.phantom, file_settings(arguments))
-    selection = bag_selection(arguments, phantom=initial.phantom)
-    source = source_of(arguments, selection, names=initial.names)
+    initial: Survey | None = None
+    names = Names()
+    if arguments.phantom is not None:
+        initial = read_survey(arguments.phantom, file_settings(arguments))
+        names = initial.names
+    given = None if initial is None else initial.phantom
+    source = source_of(arguments, bag_selection(arguments, phantom=given), names=names)
     recording = read_source(collect=arguments.collect, **source)
+    names = recording.names
     print_inputs(arguments.source, initial, recording)
     request = SurveyRequest(
         recording.frames,
-        initial.phantom,
-        _distances(arguments, initial.names),
+        given,
+        _distances(arguments, names),
         options_of(CalibrationOptions, arguments),
         arguments.principal_distance,
         keep_given=arguments.keep_given,
@@ -117,7 +126,7 @@ def run(arguments: argparse.Namespace) -> None:
     failed = [check for check in outcome.validation.checks if check.passed is False]
     is_written = not failed or arguments.force
     if is_written:
-        write_phantom(arguments.out, outcome.phantom, initial.names)
+        write_phantom(arguments.out, outcome.phantom, names)
     path = str(arguments.out) if is_written else None
     calibrate = ('calibrate', 'OTHER_EXPOSURES', '--phantom', arguments.out, '--out', 'result')
     print_result(
@@ -138,7 +147,8 @@ def _distances(arguments: argparse.Namespace, names: Names) -> list[MeasuredDist
         if bead in names.targets:
             return names.targets[bead]
         if not (bead.isascii() and bead.isdigit()):
-            raise DataError(f'--distance: {arguments.phantom} has no bead {bead!r}')
+            path = arguments.phantom or arguments.source
+            raise DataError(f'--distance: {path} has no bead {bead!r}')
         return int(bead)
 
     return [

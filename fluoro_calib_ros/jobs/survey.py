@@ -4,7 +4,8 @@
 """The survey job: coordinates of a phantom from its own exposures.
 
 The given coordinates only need to be good enough to find the position of each exposure: to some
-centimetres for a phantom of some decimetres. The self-calibration improves them.
+centimetres for a phantom of some decimetres. Without any, the shape is found from the image points
+first. The self-calibration improves them.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ..checks.survey import (
     check_survey,
     check_survey_halves,
     displaced,
-    trusted_scale,
+    taken_on_trust,
     unsurveyed,
 )
 from ..errors import DataError
@@ -29,11 +30,13 @@ from ..estimation.calibrate import calibrate_request
 from ..estimation.options import CalibrationOptions, CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
+from ..estimation.start_shape import start_shape
 from ..estimation.survey import MeasuredDistance, SurveyedBeads, surveyed_beads
 from ..exposures.collector import MIN_EXPOSURES
-from ..exposures.frame import Frames
+from ..exposures.frame import Frames, frames_without_strays, validate_frame
 from ..exposures.phantom import EXACT_SD_MM, MIN_TARGETS, Phantom
-from ..findings import Finding, Kind, Severity, too_few
+from ..findings import Finding, Kind, Place, Severity, first_few, too_few
+from ..photogrammetry.network import MIN_RAYS
 from ..rows import chosen_rows
 from .calibration import run_calibration
 
@@ -46,10 +49,11 @@ class SurveyRequest:
     ----------
     frames : mapping of str to sequence of Frame
         By fluoroscope; all are adjusted together.
-    given : Phantom
-        Coordinates and standard deviations as far as known, from a drawing or a ruler.
+    given : Phantom or None
+        Coordinates and standard deviations as far as known, from a drawing or a ruler; None if
+        nothing is known.
     distances : sequence of MeasuredDistance
-        Two or more, for scale and check.
+        Two or more, for scale and check; one is required where nothing else is known.
     options : CalibrationOptions
         Of the self-calibration; the datum is that of a free network.
     principal_distance : float or None
@@ -61,7 +65,7 @@ class SurveyRequest:
     __repr__ = brief_repr
 
     frames: Frames
-    given: Phantom
+    given: Phantom | None
     distances: Sequence[MeasuredDistance] = ()
     options: CalibrationOptions = field(default_factory=CalibrationOptions)
     principal_distance: float | None = None
@@ -124,8 +128,14 @@ def survey(
         cannot be of the phantom, or that show too few beads well.
     """
     began = time.perf_counter()
-    _require_known(request)
-    result = _free_network(request, progress)
+    is_given = request.given is not None
+    found: list[Finding] = []
+    if not is_given:
+        request, found = _with_shape(request)
+    given = request.given
+    assert given is not None
+    _require_known(request, given)
+    result = _free_network(request, given, progress)
     if not result.converged:
         raise DataError(
             'the adjustment did not converge: the exposures hardly determine coordinates, '
@@ -133,38 +143,84 @@ def survey(
             kind=Kind.UNDETERMINED,
             advice='turn and move the phantom more between the exposures',
         )
-    surveyed = surveyed_beads(result, request.given, request.distances)
+    surveyed = surveyed_beads(result, given, request.distances)
     left_out = unsurveyed(surveyed)
     beads = _without(surveyed, left_out)
-    checks = check_survey(surveyed)
+    checks = check_survey(surveyed, is_given)
     if len(beads.target_id) < MIN_TARGETS:
         raise DataError(
             f'only {len(beads.target_id)} beads can be surveyed',
             *(replace(finding, severity=Severity.ERROR) for finding in left_out),
             kind=Kind.FEW_TARGETS,
         )
-    checks.append(_halves(request, result))
-    displacement = displaced(beads)
+    checks.append(_halves(request, given, result))
+    displacement = displaced(beads) if is_given else None
     return SurveyOutcome(
-        _phantom(request, beads),
+        _phantom(given, beads, request.keep_given and is_given),
         beads,
         Validation(
             verdict_of(checks),
             tuple(checks),
             {},
             time.perf_counter() - began,
-            notes=tuple(trusted_scale(beads)),
+            notes=tuple(taken_on_trust(beads, is_given)),
         ),
-        (*result.findings, *left_out, *([] if displacement is None else [displacement])),
+        (*found, *result.findings, *left_out, *([] if displacement is None else [displacement])),
         result,
     )
 
 
-def _require_known(request: SurveyRequest) -> None:
+def _with_shape(request: SurveyRequest) -> tuple[SurveyRequest, list[Finding]]:
+    """Return the request with the shape of the targets, at the scale of the distances.
+
+    Also return findings on image points that are not used. Raises DataError.
+    """
+    if not request.distances:
+        raise DataError(
+            'without given coordinates, images do not show the scale of the phantom',
+            kind=Kind.DISTANCES,
+            advice='measure two distances or more between beads that are far apart, and give them',
+        )
+    ids = np.unique(
+        np.concatenate([f.target_id for view in request.frames.values() for f in view])
+    )
+    unknown = Phantom(ids, np.zeros((len(ids), 3)), np.ones(len(ids)))
+    frames, findings = frames_without_strays(request.frames, unknown)
+    for view_frames in frames.values():
+        for frame in view_frames:
+            validate_frame(frame, unknown)
+    principal = request.principal_distance
+    shape = start_shape(frames, None if principal is None else dict.fromkeys(frames, principal))
+    sd = np.full(len(shape.target_id), max(shape.sd, EXACT_SD_MM))
+    phantom = Phantom(shape.target_id, shape.xyz, sd)
+    _require_known(request, phantom)
+    ends = np.array([(one.first, one.second) for one in request.distances])
+    lengths = np.linalg.norm(np.subtract(*shape.xyz[phantom.index(ends).T]), axis=1)
+    scale = np.median([one.length_mm for one in request.distances] / lengths)
+    given = replace(phantom, xyz_mm=scale * shape.xyz, sd_mm=scale * sd)
+    left_out = np.setdiff1d(ids, shape.target_id)
+    if len(left_out):
+        findings.append(
+            Finding(
+                Kind.FEW_RAYS,
+                f'{len(left_out)} targets are seen in fewer than {MIN_RAYS} exposures, too few to '
+                f'determine them: {first_few(left_out)}',
+                Place(target_id=tuple(left_out.tolist())),
+                severity=Severity.NOTE,
+            )
+        )
+    used = {
+        name: [chosen_rows(f, np.isin(f.target_id, shape.target_id)) for f in view_frames]
+        for name, view_frames in frames.items()
+    }
+    return replace(request, frames=used, given=given), findings
+
+
+def _require_known(request: SurveyRequest, given: Phantom) -> None:
     """Raise DataError for a distance to a bead that the phantom does not have."""
     for distance in request.distances:
         for bead in (distance.first, distance.second):
-            if request.given.index([bead])[0] < 0:
+            if given.index([bead])[0] < 0:
                 raise DataError(
                     f'{distance.name}: bead {bead} is not on the phantom', kind=Kind.NOT_IN_BOTH
                 )
@@ -172,6 +228,7 @@ def _require_known(request: SurveyRequest) -> None:
 
 def _free_network(
     request: SurveyRequest,
+    given: Phantom,
     progress: Callable[[str, Round], None] | None,
 ) -> CalibrationResult:
     """Self-calibrate with inner constraints; if needed, improve rough coordinates and retry.
@@ -187,15 +244,15 @@ def _free_network(
         ).result
 
     try:
-        return adjusted(request.given, force=False)
+        return adjusted(given, force=False)
     except DataError as error:
         # Exposures that do not fit the given coordinates may fit those found from the images.
         if any(finding.kind is not Kind.OTHER_PHANTOM for finding in error.findings):
             raise
         refused = error
     try:
-        rough = adjusted(request.given, force=True)
-        return adjusted(_with_adjusted(request.given, rough), force=False)
+        rough = adjusted(given, force=True)
+        return adjusted(_with_adjusted(given, rough), force=False)
     except DataError:
         raise refused from None
 
@@ -209,6 +266,7 @@ def _with_adjusted(initial: Phantom, result: CalibrationResult) -> Phantom:
 
 def _halves(
     request: SurveyRequest,
+    given: Phantom,
     result: CalibrationResult,
 ) -> Check:
     """Compare two surveys, each from every second exposure."""
@@ -221,9 +279,7 @@ def _halves(
         return not_made(Kind.HALVES, reason)
     # Start from the better coordinates found so far. The scale is not compared, so exclude its
     # uncertainty.
-    start = replace(
-        _with_adjusted(request.given, result), sd_mm=np.full(len(request.given.sd_mm), EXACT_SD_MM)
-    )
+    start = replace(_with_adjusted(given, result), sd_mm=np.full(len(given.sd_mm), EXACT_SD_MM))
     surveys = []
     for half in (set(numbers[::2]), set(numbers[1::2])):
         frames = {
@@ -244,13 +300,12 @@ def _without(beads: SurveyedBeads, findings: Sequence[Finding]) -> SurveyedBeads
     return beads.without({target for finding in findings for target in finding.place.target_id})
 
 
-def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:
-    """Return the phantom with the surveyed coordinates."""
-    given = request.given
+def _phantom(given: Phantom, beads: SurveyedBeads, keep_given: bool) -> Phantom:
+    """Return the phantom with the surveyed coordinates; keep_given: with all its beads."""
     row = given.index(beads.target_id)
     surveyed_mm = np.round(beads.xyz_mm, 6)
     surveyed_sd = np.maximum(np.round(beads.sd_mm, 6), EXACT_SD_MM)
-    if not request.keep_given:
+    if not keep_given:
         return replace(chosen_rows(given, row), xyz_mm=surveyed_mm, sd_mm=surveyed_sd)
     # Assume given coordinates as far off as those of surveyed beads were, if not more by their sd.
     deviation_mm = float(np.sqrt(np.mean(beads.off_mm**2) / 3))

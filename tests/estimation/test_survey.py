@@ -17,7 +17,7 @@ from fluoro_calib_ros.checks.survey import (
     check_survey,
     check_survey_halves,
     displaced,
-    trusted_scale,
+    taken_on_trust,
     unsurveyed,
 )
 from fluoro_calib_ros.errors import DataError
@@ -357,7 +357,7 @@ def test_distances_that_are_wrong_alike_contradict_coordinates_that_are_not_roug
     vague = replace(rough(rig), sd_mm=np.full(len(rig.true_mm), 3.0))
     beads = surveyed_beads(outcome.result, vague, distances)
     assert checked(beads, Kind.SCALE).passed and verdict_of(check_survey(beads)) == 'pass'
-    (trusted,) = trusted_scale(beads)
+    (trusted,) = taken_on_trust(beads)
     assert trusted.kind is Kind.TAKEN_ON_TRUST and trusted.numbers['scale'] > 0.03
 
 

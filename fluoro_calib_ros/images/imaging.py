@@ -43,7 +43,10 @@ START_MASK_PX = 3.0
 # four images with a mask of factor 1.5 and 3 px, and at most .15 in 41 images without one but in
 # one, whose profile was not the best.
 COMMON = 0.15
-FREE_OF_EDGES = 0.25  # share of windows without edges of plates, at least
+# Share of isolated shadows below which something may be wrong with them. In a dense lattice, a hole
+# is isolated where its neighbours are not holes.
+ISOLATED = 0.05
+FREE_OF_EDGES = 0.25  # share of windows that are free of edges, at least
 MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image
 # Largest lack of fit with a mask over that without one. It was .43 to .88 in seven images with a
 # mask whose parameters were found, and .98 in one where they were not.
@@ -253,15 +256,7 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     distance = _distance(shadows)
     alone = shadows.seen & np.isfinite(size) & (distance > 2 * start.reach_px)
     rows = _sampled(np.flatnonzero(alone), SAMPLE)
-    if len(rows) < FEW:
-        return imaging
-    wide = _profile_fit(
-        light, shadows.uv[rows], (shadows.shape[rows], size[rows]), imaging.profile, start.reach_px
-    )
-    disturbed = wide.misfit > DISTURBED * np.quantile(wide.misfit, FREE_OF_EDGES)
-    alone[rows[disturbed]] = False
-    rows = rows[~disturbed]
-    if len(rows) < FEW:
+    if len(rows) < FEW or alone.sum() < ISOLATED * shadows.seen.sum():
         return imaging
     shapes = shadows.shape[rows], size[rows]
     fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)
@@ -269,30 +264,28 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
         fit = _profile_fit(light, shadows.uv[rows], shapes, profile=imaging.profile, former=fit)
     if np.median(fit.common_share()) < COMMON:
         return imaging
-    isolated = replace(shadows, alone=alone)
-    profile = start
-    # Far from the right mask, a share of scattered light that is estimated with it runs away.
-    for estimated in (MASKED, (*MASKED, 'scatter')):
-        profile = _typical(
-            light, isolated, imaging.size, start.radius_px, start=profile, estimated=estimated
-        )
-    if profile.sharpening < MIN_SHARPENING or not _is_inside(profile.mask_px, LIMITS['mask_px']):
-        return imaging
-    plain, masked = (
+    masks = [_masked(light, replace(shadows, alone=alone), imaging, start)]
+    # Edges of plates spoil the estimate, and comparisons: windows without them decide.
+    wide = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile, start.reach_px)
+    free = wide.misfit <= DISTURBED * np.quantile(wide.misfit, FREE_OF_EDGES)
+    if FEW <= np.count_nonzero(free) < len(rows):
+        rows = rows[free]
+        shapes = shadows.shape[rows], size[rows]
+        fit = _profile_fit(light, shadows.uv[rows], shapes, imaging.profile)
+        alone = np.isin(np.arange(len(alone)), rows)
+        masks.append(_masked(light, replace(shadows, alone=alone), imaging, start))
+    reach_px = max(profile.reach_px for profile in masks)
+    plain, *masked = (
         _lack(
             _profile_fit(
-                light,
-                shadows.uv[rows],
-                shapes,
-                profile=one,
-                reach_px=profile.reach_px,
-                former=fit,
+                light, shadows.uv[rows], shapes, profile=one, reach_px=reach_px, former=fit
             )
         )
-        for one in (imaging.profile, profile)
+        for one in (imaging.profile, *masks)
     )
-    if masked >= BETTER * plain:
+    if min(masked) >= BETTER * plain:
         return imaging
+    profile = masks[int(np.argmin(masked))]
     fit = BeadFit(
         light, shadows.uv[rows], shapes[0], profile=profile, noise=imaging.noise, size=shapes[1]
     )
@@ -300,10 +293,17 @@ def _with_mask(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:
     return replace(imaging, profile=profile, noise=noise_of_windows(fit))
 
 
-def _is_inside(value: float, limits: tuple[float, float]) -> bool:
-    """Return whether an estimated value is not at one of its limits, at which it has run away."""
-    low, high = limits
-    return low * (1 + RADIUS_SD) < value < high * (1 - RADIUS_SD)
+def _masked(light: Light, shadows: Expected, imaging: Imaging, start: Profile) -> Profile:
+    """Return the profile of isolated shadows with an unsharp mask, or without if it is weak."""
+    profile = start
+    # Far from the right mask, a share of scattered light that is estimated with it runs away.
+    for estimated in (MASKED, (*MASKED, 'scatter')):
+        profile = _typical(
+            light, shadows, imaging.size, start.radius_px, start=profile, estimated=estimated
+        )
+    if profile.sharpening < MIN_SHARPENING:
+        return replace(profile, sharpening=0.0, mask_px=0.0)
+    return profile
 
 
 def _with_scatter(light: Light, shadows: Expected, imaging: Imaging) -> Imaging:

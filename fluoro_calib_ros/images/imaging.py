@@ -43,8 +43,8 @@ START_MASK_PX = 3.0
 # four images with a mask of factor 1.5 and 3 px, and at most .15 in 41 images without one but in
 # one, whose profile was not the best.
 COMMON = 0.15
-# Share of isolated shadows below which something may be wrong with them. In a dense lattice, a hole
-# is isolated where its neighbours are not holes.
+# Share of isolated shadows below which something may be wrong with them: in a dense lattice, a
+# hole is isolated where its neighbours are not holes.
 ISOLATED = 0.05
 FREE_OF_EDGES = 0.25  # share of windows that are free of edges, at least
 MIN_SHARPENING = 0.1  # factor of a mask that hardly changes an image

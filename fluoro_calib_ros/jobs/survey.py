@@ -181,9 +181,10 @@ def _with_shape(request: SurveyRequest) -> tuple[SurveyRequest, list[Finding]]:
             kind=Kind.DISTANCES,
             advice='measure two distances or more between beads that are far apart, and give them',
         )
-    ids = np.unique(
-        np.concatenate([f.target_id for view in request.frames.values() for f in view])
-    )
+    shown = [frame.target_id for view in request.frames.values() for frame in view]
+    if not shown:
+        raise DataError('there are no exposures', kind=Kind.FEW_EXPOSURES)
+    ids = np.unique(np.concatenate(shown))
     unknown = Phantom(ids, np.zeros((len(ids), 3)), np.ones(len(ids)))
     frames, findings = frames_without_strays(request.frames, unknown)
     for view_frames in frames.values():

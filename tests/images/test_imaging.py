@@ -499,6 +499,26 @@ def test_an_unsharp_mask_is_estimated_if_there_is_one(factor, scatter, clipped):
     assert imaging.profile.sharpening == pytest.approx(factor, rel=0.15)
 
 
+def test_an_unsharp_mask_is_estimated_beside_edges_of_plates():
+    """Edges cross the windows of 12 of 20 isolated shadows; the others decide."""
+    image, shadows = radiograph_of_pairs(0.1, 10_000)
+    rng = np.random.default_rng(0)
+    y, x = np.indices(image.shape)
+    passed = np.ones(image.shape)
+    for u, v in shadows.uv[:12]:
+        angle = rng.uniform(0, np.pi)
+        across = (x - u) * np.cos(angle) + (y - v) * np.sin(angle)
+        passed[(np.hypot(x - u, y - v) < 26) & (across > rng.uniform(3, 8))] = 0.75
+    image = image * cv2.GaussianBlur(passed, (0, 0), 1.0)
+    image = (image + 1.5 * (image - cv2.GaussianBlur(image, (0, 0), 2.5))).astype(np.float32)
+    light = Light(image, np.ones(image.shape, bool))
+    noise = estimate_noise(image, light.field)
+    profile = first_imaging(light, noise, shadows, RADIUS, size=np.ones(36)).profile
+    assert profile.sharpening == pytest.approx(1.5, rel=0.05)
+    assert profile.mask_px == pytest.approx(2.5, rel=0.05)
+    assert profile.radius_px == pytest.approx(RADIUS, abs=0.05)
+
+
 def test_an_unsharp_mask_may_leave_less_than_no_direct_light():
     light = Light(np.full((60, 60), 1000.0, np.float32), np.ones((60, 60), bool))
     for sharpening, mask_px in ((0.0, 0.0), (1.5, 2.5)):

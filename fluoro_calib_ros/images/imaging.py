@@ -27,11 +27,6 @@ PROFILE_STEPS = 3
 # The same where pixels are clipped: the light that they hide converges more slowly. With 3, 268 of
 # 291 beads were measured in 10 over-exposed renderings with plates, with 4 282, with 5 284.
 CLIPPED_STEPS = 4
-# Factor by which noise may be too large for an estimate of the profile in a clipped image: what
-# clipped pixels tell depends on it. With too much, the light that they hide ran away from the
-# profile in 2 of 20 over-exposed renderings with plates.
-NOISE_FACTOR = 1.5
-NOISE_ROUNDS = 2
 PROFILE_BEADS = 100  # largest number of beads for the profile
 # Rounds without a better fit, after which the best profile is chosen in windows of equal size: a
 # hard edge with a wide blur looks like a sphere. If the radius grows by a half, fits get worse
@@ -102,11 +97,6 @@ def estimate_profile(
         fit = _profile_fit(
             light, place, shapes, profile=before, reach_px=least_reach_px, former=fit
         )
-        for _ in range(NOISE_ROUNDS if light.clipping else 0):
-            if fit.typical() < 1 / NOISE_FACTOR:
-                fit = _profile_fit(
-                    light, place, shapes, profile=before, reach_px=least_reach_px, former=fit
-                )
         place = fit.uv
         lacks.append(_lack(fit))
         closest = fit if lacks[-1] == min(lacks) else closest

@@ -122,7 +122,7 @@ def taken_on_trust(beads: SurveyedBeads, is_given: bool = True) -> list[Finding]
             note,
             Place(name=''),
             severity=Severity.NOTE,
-            numbers={'scale': unseen},
+            numbers={'scale': unseen} if is_given else {},
         )
         for note in notes
     ]

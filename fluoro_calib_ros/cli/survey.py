@@ -110,7 +110,8 @@ def run(arguments: argparse.Namespace) -> None:
     given = None if initial is None else initial.phantom
     source = source_of(arguments, bag_selection(arguments, phantom=given), names=names)
     recording = read_source(collect=arguments.collect, **source)
-    names = recording.names
+    if initial is None:
+        names = recording.names
     print_inputs(arguments.source, initial, recording)
     request = SurveyRequest(
         recording.frames,

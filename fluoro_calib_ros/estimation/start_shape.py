@@ -44,6 +44,9 @@ ITERATIONS = 20  # of the perspective; in virtual rigs, 10 gave the same residua
 # residuals of 0.25 px to 0.5 px, and the shape by less than a millimetre.
 USUAL_DISTANCE = 4.0
 TAIL = 3.0  # scales of the residuals beyond which weights decrease, as those of Cauchy
+# Largest residual of parallel projections over the distances of image points from their centre. If
+# the depth of a phantom is a third of its distance, perspective changes these by a sixth.
+MAX_PERSPECTIVE = 0.25
 # Residuals of the mirror image over those of the shape, from which the images tell them apart. It
 # is 4 to 12 for phantoms of 120 to 300 mm in virtual rigs, and 1 for one without perspective.
 MIN_RATIO = 1.5
@@ -216,6 +219,18 @@ def _factorised(points: _Points) -> _Parallel:
     parallel = _Parallel(axes, shift, xyz)
     for _ in range(SWEEPS):
         parallel = parallel.swept(points.uv, points.seen.astype(float))
+    residual = parallel.residual(points.uv)
+    used = points.seen & np.isfinite(residual).all(axis=2)
+    middle = parallel.centred().shift[:, None]
+    share = float(np.sqrt(np.mean(residual[used] ** 2) / np.mean((points.uv - middle)[used] ** 2)))
+    if share > MAX_PERSPECTIVE:
+        raise DataError(
+            f'no rigid shape fits the image points: residuals are {share:.0%} of their distances '
+            'from the centre',
+            kind=Kind.OTHER_PHANTOM,
+            advice='check that an id is that of the same bead in all exposures and fluoroscopes',
+            numbers={'share': share},
+        )
     return parallel
 
 

@@ -103,6 +103,14 @@ def test_a_few_wrong_ids_do_not_change_the_shape():
     assert error_of(shape.xyz, xyz) < 0.01
 
 
+def test_ids_that_differ_between_fluoroscopes_are_refused():
+    frames, _ = exposures()
+    other = np.random.default_rng(0).permutation(BEADS)
+    renamed = [replace(frame, target_id=other[frame.target_id]) for frame in frames['b']]
+    with refused(Kind.OTHER_PHANTOM):
+        start_shape({**frames, 'b': renamed})
+
+
 def test_what_does_not_determine_a_shape_is_refused():
     frames, _ = exposures()
     two = {name: view[:1] for name, view in frames.items()}

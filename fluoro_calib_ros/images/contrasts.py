@@ -75,11 +75,20 @@ def black_level(beads: Beads, black: float, clipping: Clipping = UNCLIPPED) -> f
     Beads absorb a share of the light, so that their contrast is proportional to it. If the grey
     values were windowed for display, it is proportional to their difference from another one; in
     a logarithmic image, it is the same everywhere. black: the grey value above which the light is
-    measured; it stays, if it is likely. Beads in light that clipped pixels hide show nothing of
-    it: if that light is wrong, their contrasts are wrong by as much.
+    measured; it stays, if it is likely.
+
+    If clipped pixels hide the light around a bead, an error of the light is one of the contrast,
+    as if the dark inside of the shadow had no light. Such beads do not show a larger grey value.
     """
     good = beads.measured & (beads.light > 0) & (beads.misfit < UNDISTURBED)
-    good &= clipping.leaves(beads.light)
+    level = _black_level(beads, black, good)
+    if level <= black:
+        return level
+    return _black_level(beads, black, good & clipping.leaves(beads.light))
+
+
+def _black_level(beads: Beads, black: float, good: NDArray[np.bool_]) -> float:
+    """Return the grey value at which good beads (n,) would have no contrast."""
     line = _Contrasts.of(beads, good)
     if line is None or line.slope < -SURE_SDS * line.sd or abs(line.offset) < SURE_SDS * line.sd:
         return black

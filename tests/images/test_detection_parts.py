@@ -211,7 +211,7 @@ def test_contrasts_tell_the_grey_value_of_no_light(black):
     assert contrasts.black_level(few, 0.0) == 0.0
 
 
-def test_hidden_light_tells_no_grey_value_of_no_light():
+def test_hidden_light_shows_no_larger_grey_value_of_no_light():
     """Only the dark inside of shadows is seen: an error of the light is one of the contrast."""
     seen = np.linspace(60.0, 180.0, 64)
     hidden = np.linspace(280.0, 420.0, 64)
@@ -219,6 +219,9 @@ def test_hidden_light_tells_no_grey_value_of_no_light():
     dark.depth = 1 - 60.0 / hidden
     assert contrasts.black_level(dark, 0.0) == pytest.approx(60.0)
     assert contrasts.black_level(dark, 0.0, Clipping(high=255.0)) == 0.0
+    # The opposite is no such error.
+    below = contrasting(-60.0, hidden)
+    assert contrasts.black_level(below, 0.0, Clipping(high=255.0)) == pytest.approx(-60.0, abs=1)
     half = contrasting(30.0, np.where(np.arange(64) % 2, seen, hidden))
     half.depth[::2] = 1 - 60.0 / hidden[::2]
     assert contrasts.black_level(half, 0.0, Clipping(high=255.0)) == pytest.approx(30.0, abs=1)

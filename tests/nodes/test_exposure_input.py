@@ -47,15 +47,19 @@ def exposures(logger):
 def observed(name, number, stamp_s):
     """Return an exposure of the rig as a message; its number is that of the pose."""
     frame = rigs.exposures()[name][number - 1]
+    return message_of(frame, number, stamp_s, np.full(len(frame.uv), 0.1))
+
+
+def message_of(frame, number, stamp_s, sigma):
     return ObservedFrame(
         stamp_s,
         0,
-        f'{name}_optical',
+        f'{frame.fluoroscope}_optical',
         number,
         frame.image_size,
         np.asarray(frame.target_id, np.uint32).tobytes(),
         *frame.uv.T,
-        sigma=np.full(len(frame.uv), 0.1),
+        sigma=sigma,
         start=b'',
     )
 
@@ -133,17 +137,7 @@ CUBE, SHEET = 0, 1
 def of_part(name, part, number):
     """Return an exposure of a part as a message."""
     frame = rigs.sheet_and_cube()[0][name][part]
-    return ObservedFrame(
-        number,
-        0,
-        f'{name}_optical',
-        number,
-        frame.image_size,
-        np.asarray(frame.target_id, np.uint32).tobytes(),
-        *frame.uv.T,
-        sigma=frame.sigma,
-        start=b'',
-    )
+    return message_of(frame, number, number, frame.sigma)
 
 
 def counts(exposures):

@@ -89,11 +89,10 @@ def start_shape(
         [given.get(f.fluoroscope, USUAL_DISTANCE * f.image_size[0]) for f in images]
     )
     parallel = _factorised(points)
-    found = min(
+    found, mirrored = sorted(
         (_in_perspective(parallel, points, distance, sign) for sign in (1.0, -1.0)),
         key=lambda one: one.residual_px,
     )
-    mirrored = _in_perspective(parallel, points, distance, -found.sign)
     if not mirrored.residual_px > MIN_RATIO * found.residual_px:
         raise DataError(
             'the images do not tell the shape of the phantom from its mirror image: residuals are '
@@ -112,7 +111,7 @@ def start_shape(
             advice='turn the phantom more between the exposures, or give approximate coordinates',
         )
     axes[2] *= np.linalg.det(axes)
-    sd = found.residual_px / float(np.median(found.scale))
+    sd = found.residual_px / float(np.nanmedian(found.scale))
     return StartShape(target_id[known], xyz @ axes.T, sd, found.residual_px)
 
 
@@ -288,7 +287,6 @@ def _products(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.floa
 class _Solution:
     """A shape in perspective images."""
 
-    sign: float  #: of the parallel projections from which it was iterated
     xyz: NDArray[np.float64]  #: (n, 3), NaN if not known
     scale: NDArray[np.float64]  #: (m,) of images, NaN if not known
     residual_px: float
@@ -315,7 +313,7 @@ def _in_perspective(
         parallel = _metric(parallel.swept(uv, weight))
         off = np.linalg.norm(parallel.residual(uv), axis=2)
         counted = points.seen & np.isfinite(off)
-        usual = float(np.median(off[counted]))
+        usual = max(float(np.median(off[counted])), ROUNDING)
         weight = np.where(counted, 1 / (1 + (off / (TAIL * usual)) ** 2), points.seen)
     residual = float(np.sqrt(np.average(off[counted] ** 2 / 2, weights=weight[counted])))
-    return _Solution(sign, parallel.xyz, scale, residual)
+    return _Solution(parallel.xyz, scale, residual)

@@ -22,6 +22,7 @@ from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import read_phantom
 from fluoro_calib_ros.jobs.survey import SurveyRequest, survey
+from fluoro_calib_ros.rows import chosen_rows
 
 BEADS = 40
 
@@ -93,6 +94,20 @@ def test_a_third_of_the_targets_in_each_image_is_enough():
     phantom = rigs.rig().phantom
     assert len(shape.target_id) > 0.99 * len(phantom.target_id)
     assert error_of(shape.xyz, phantom.xyz_mm[phantom.index(shape.target_id)]) < 0.02
+
+
+def test_an_image_of_few_targets_and_images_without_noise_are_no_exception():
+    frames, xyz = exposures()
+    few = chosen_rows(frames['a'][0], slice(0, 3))
+    shape = start_shape({**frames, 'a': [*frames['a'], replace(few, number=99)]})
+    assert error_of(shape.xyz, xyz) < 0.005 and np.isfinite(shape.sd)
+    rng = np.random.default_rng(0)
+    views = [Rotation.from_rotvec(turn).as_matrix() for turn in rng.uniform(-0.6, 0.6, (6, 3))]
+    exact = [
+        Frame('a', number, np.arange(BEADS), 4096 * x[:, :2] / x[:, 2:] + 511.5, (1024, 1024))
+        for number, x in enumerate(xyz @ view.T + [0, 0, 900] for view in views)
+    ]
+    assert error_of(start_shape({'a': exact}).xyz, xyz) < 1e-6
 
 
 def test_a_few_wrong_ids_do_not_change_the_shape():

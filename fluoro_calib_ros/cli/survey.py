@@ -102,6 +102,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.survey import SurveyRequest, survey
 
     check_output_file(arguments.out, input_paths(arguments))
+    if arguments.keep_given and arguments.phantom is None:
+        raise DataError('--keep-given needs the coordinates of --phantom')
     initial: Survey | None = None
     names = Names()
     if arguments.phantom is not None:

@@ -129,10 +129,10 @@ def _request(
         print_notes(survey.notes)
         phantom = survey.phantom
     saved_phantom = arguments.directory / PHANTOM
-    shown = phantom
-    if shown is None and saved_phantom.exists():
-        shown = read_phantom(saved_phantom)
     if arguments.source is not None:
+        shown = phantom
+        if shown is None and saved_phantom.exists():
+            shown = read_phantom(saved_phantom)
         selection = BagSelection(angles=angle_options(arguments), phantom=shown)
         source = source_of(arguments, selection)
         recording = read_source(collect=arguments.collect, **{**source, 'settings': settings})

@@ -203,4 +203,7 @@ def test_the_command_surveys_without_a_phantom_file(tmp_path, capsys):
     options = ['--image-size', '1024x1024', '--model', 'none', '--out', str(out)]
     main(['survey', str(tmp_path / 'points.csv'), *told, *options])
     assert 'Verdict: pass' in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(['survey', str(tmp_path / 'points.csv'), *told, *options, '--keep-given'])
+    assert '--keep-given needs' in capsys.readouterr().err
     np.testing.assert_allclose(read_phantom(out).xyz_mm, outcome.phantom.xyz_mm, atol=1e-3)
